@@ -3,10 +3,12 @@
 Constructors of algorithms, ``make_vec_env`` and evaluations take what Gymnasium calls a vector
 environment and ask :func:`as_vec_env` for a ``VecEnv``. :class:`GymnasiumVecEnv` is the adapter of
 those that are nothing simpler, :class:`TensorVecEnv` that of simulators that step torch tensors.
+:func:`layers` walks through wrappers, :func:`normalizer_of` finds the one that normalises.
 """
 
 import pkgutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -16,10 +18,12 @@ import torch as th
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import SyncVectorEnv, VectorEnv
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from sb3_guard.checks import ContractError
+from sb3_guard.checks import ContractError, is_number
 from sb3_guard.fields import fit
 
 #: ``cost(obs, actions, next_obs, infos)``, of N rows at once
@@ -43,6 +47,67 @@ def as_vec_env(env: Any) -> VecEnv:
         return DummyVecEnv([partial(list(env.envs).__getitem__, i) for i in range(env.num_envs)])
     entry_point = getattr(env, "vec_entry_point", None)
     return pkgutil.resolve_name(entry_point)(env) if entry_point else GymnasiumVecEnv(env)
+
+
+def layers(env: Any) -> Iterator[Any]:
+    """The wrappers of an environment from the outside in, and the environment itself last."""
+    while isinstance(env, gym.Wrapper | VecEnvWrapper):
+        yield env
+        env = env.env if isinstance(env, gym.Wrapper) else env.venv
+    yield env
+
+
+def normalizer_of(env: VecEnv | None) -> VecNormalize | None:
+    """
+    The one wrapper that normalises observations and rewards; None: there is none.
+
+    :raises ContractError: there are two
+    """
+    normalizers = [layer for layer in layers(env) if isinstance(layer, VecNormalize)]
+    if len(normalizers) > 1:
+        raise ContractError(
+            "env has two VecNormalize, and Stable-Baselines3 knows of the outer one alone: keep one"
+        )
+    return normalizers[0] if normalizers else None
+
+
+def moments_of(env: VecEnv | None) -> dict[str, RunningMeanStd]:
+    """What normalises observations, by their entries (``""``: they have none); empty: nothing."""
+    normalizer = normalizer_of(env)
+    if normalizer is None or not normalizer.norm_obs:
+        return {}
+    moments = normalizer.obs_rms
+    return moments if isinstance(moments, dict) else {"": moments}
+
+
+def lacks_statistics(model: Any, env: VecEnv | None) -> bool:
+    """Whether an agent learnt from normalised observations, and ``env`` has no means of them."""
+    now = isinstance(model, BaseAlgorithm) and bool(moments_of(model.get_env()))
+    if not getattr(model, "learnt_normalized", now):
+        return False
+    moments = moments_of(env)
+    # Those of a new VecNormalize are of no observation.
+    return not moments or any(part.count < 1 for part in moments.values())
+
+
+def own_statistics(env: VecEnv) -> str:
+    """A fault where a wrapper of Gymnasium normalises by statistics of its own; empty: none."""
+    for attribute, name in (("obs_rms", "Observation"), ("return_rms", "Reward")):
+        with suppress(NotImplementedError):  # a vectorised environment need not tell
+            if env.has_attr(attribute):
+                fault = "moves its statistics as it plays, and no file has them: use VecNormalize"
+                return f"Normalize{name} {fault}"
+    return ""
+
+
+def step_limits(env: VecEnv) -> list[float]:
+    """Steps of an episode at most, in each row; empty where not stated."""
+    for name in ("_max_episode_steps", "max_episode_steps"):  # of TimeLimit, and of our batches
+        with suppress(NotImplementedError):  # a vectorised environment need not tell
+            limits = env.get_attr(name) if env.has_attr(name) else []
+            if limits and all(is_number(limit) and limit > 0 for limit in limits):
+                return limits
+    return []
 
 
 def each(function: Callable[..., Any], *obs: Any) -> Any:

@@ -14,6 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.common.evaluation import (
+    BROKEN_OFF,
     Evaluation,
     check_agent,
     evaluate_policy,
@@ -23,7 +24,7 @@ from sb3_guard.common.evaluation import (
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import cost_keys_of, find_monitor
 from sb3_guard.judging import Limits
-from sb3_guard.vector import as_vec_env
+from sb3_guard.vector import as_vec_env, normalizer_of
 
 # What a run continues with
 KEPT = (
@@ -159,10 +160,7 @@ class CostEvalCallback(EvalCallback):
         self.limits()
         check_agent(self.model, self.eval_env)
         if share_environment(self.training_env, self.eval_env):
-            raise ValueError(
-                "eval_env is the training environment, whose episodes every evaluation would "
-                "break off: make another one for it"
-            )
+            raise ValueError(BROKEN_OFF)
 
     def limits(self) -> Limits:
         """
@@ -240,9 +238,13 @@ class CostEvalCallback(EvalCallback):
             self._save_best()
             if self.callback_on_new_best is not None:
                 proceed = self.callback_on_new_best.on_step()
+        self._evaluated(dict(zip(self.kinds(), played, strict=True)))
         if self.callback is not None:
             proceed = proceed and self._on_event()
         return proceed
+
+    def _evaluated(self, played: dict[bool, Evaluation]) -> None:
+        """Called after each evaluation with its episodes, by whether actions were most likely."""
 
     def _row(self, values: np.ndarray) -> list[Any]:
         """A value of each episode, NaN of those that were given up."""
@@ -274,7 +276,7 @@ class CostEvalCallback(EvalCallback):
         folder = Path(self.best_model_save_path)
         with replacing(folder / "best_model.zip") as file:
             self.model.save(file)
-        normalizer = self.model.get_vec_normalize_env()
+        normalizer = normalizer_of(self.training_env)
         if normalizer is not None:
             with replacing(folder / "best_model_vecnormalize.pkl") as file:
                 pickle.dump(normalizer, file)

@@ -12,14 +12,20 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.checks import check_cost_keys
-from sb3_guard.common.evaluation import Evaluation, evaluate_policy, lacks_statistics, moments_of
+from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.common.monitor import cost_keys_of
 from sb3_guard.fields import fit
 from sb3_guard.judging import EPISODES, ERROR, LEAST, Bound, Judgement, Limits, Verdict, decide
-from sb3_guard.vector import as_vec_env
+from sb3_guard.vector import (
+    as_vec_env,
+    lacks_statistics,
+    moments_of,
+    normalizer_of,
+    own_statistics,
+)
 
 PACKAGES = "sb3-guard", "stable-baselines3", "torch", "mujoco"
 # Arguments of an environment that change its pictures alone
@@ -173,8 +179,8 @@ def agent_hash(model: Any, env: VecEnv) -> str:
     digest.update(f"{type(policy).__name__} {policy}".encode())
     for name, tensor in sorted(weights.items()):
         digest.update(name.encode() + np.ascontiguousarray(tensor.cpu()).tobytes())
-    if moments := moments_of(env):
-        normalizer = unwrap_vec_normalize(env)
+    moments, normalizer = moments_of(env), normalizer_of(env)
+    if moments and normalizer:
         digest.update(f"{normalizer.clip_obs:g} {normalizer.epsilon:g}".encode())
     for name, part in sorted(moments.items()):
         digest.update(name.encode() + part.mean.tobytes() + part.var.tobytes())
@@ -271,10 +277,13 @@ def certify(
 
 def refuse_training_only(env: VecEnv) -> None:
     """
-    :raises ValueError: a wrapper is for training only: other costs would be certified
+    :raises ValueError: a wrapper is for training only, or has statistics that move: other costs
+        would be certified
     """
     if getattr(env, "training_only", False):  # of any wrapper
         raise ValueError("a wrapper of env is for training only: certify without it")
+    if fault := own_statistics(env):
+        raise ValueError(fault)
 
 
 def _play(

@@ -10,21 +10,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_guard.common.callbacks import CostEvalCallback
 from sb3_guard.common.certificate import Certificate, certify, refuse_training_only
-from sb3_guard.common.evaluation import (
-    Evaluation,
-    evaluate_policy,
-    moments_of,
-    sync_normalization,
-)
+from sb3_guard.common.evaluation import Evaluation, evaluate_policy, sync_normalization
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import cost_keys_of
 from sb3_guard.fields import fit
 from sb3_guard.judging import EPISODES, LEAST, TRIES, Limits
+from sb3_guard.vector import moments_of, normalizer_of
 
 HELP = (
     "a training with more steps (-n), more episodes (--certify), a lower cost_limit than you need, "
@@ -180,7 +176,7 @@ class DeliveryCallback(CostEvalCallback):
             "played": {
                 kind: (float(episodes.returns.mean()), th.from_numpy(episodes.limited))
                 for kind, episodes in played.items()
-                if len(episodes) == len(episodes.limited) > 1
+                if episodes.whole
             },
         }
 
@@ -286,7 +282,7 @@ class DeliveryCallback(CostEvalCallback):
         with replacing(self.folder / MODEL) as file:
             self.model.save(file)
         self.model.num_timesteps = trained
-        normalizer = unwrap_vec_normalize(self.certificate_env)
+        normalizer = normalizer_of(self.certificate_env)
         if normalizer is not None:
             normalizer.save(str(self.folder / NORMALIZER))
         # Last: until then the earlier certificate is of another agent than the one that is there.

@@ -4,7 +4,7 @@ import copy
 import inspect
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,35 +16,34 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import (
-    VecEnv,
-    VecMonitor,
-    VecNormalize,
-    is_vecenv_wrapped,
-    unwrap_vec_normalize,
-)
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
 from sb3_guard.algorithms.common.constrained import Constrained
-from sb3_guard.checks import NumberError, check_cost_keys, is_number
+from sb3_guard.checks import NumberError, check_cost_keys
 from sb3_guard.common.monitor import cost_keys_of, total_cost
-from sb3_guard.costs import (
-    EpisodeCost,
-    EpisodeCosts,
-    Estimate,
-    beside,
-    bounded_name,
-    estimate,
-    read_costs,
+from sb3_guard.costs import EpisodeCost, EpisodeCosts, read_costs
+from sb3_guard.judging import Limits, Mean
+from sb3_guard.vector import (
+    as_vec_env,
+    lacks_statistics,
+    layers,
+    moments_of,
+    normalizer_of,
+    own_statistics,
+    step_limits,
 )
-from sb3_guard.vector import as_vec_env
 
+BROKEN_OFF = (
+    "eval_env is the training environment, whose episodes every evaluation would break off: make "
+    "another one for it"
+)
 LONGEST = 20_000  # steps of an episode that nothing ends, after which it is given up
 
 
 @dataclass(frozen=True)
 class Evaluation:
     """
-    What :func:`evaluate_policy` saw; E episodes in the order in which they ended.
+    What :func:`evaluate_policy` saw; E episodes in the order of their seeds.
 
     :param returns: undiscounted return of each episode, shape [E]
     :param costs: undiscounted cost of each episode, shape [E]: of the one cost key, or, where
@@ -52,61 +51,60 @@ class Evaluation:
         its costs, of an episode that a physics error ended (``info["physics_error"]``)
     :param lengths: steps of each episode, shape [E]
     :param key_costs: episode cost of each of the cost keys asked for, shape [E, m]
+    :param max_costs: highest cost of a step, by key, shape [E, m]; 0 where none is above it
+    :param limits: the model's limits on these costs, and the cost keys
     :param successes: ``info["is_success"]`` at the end of the episodes that report one
     :param unfinished: return, cost and steps of the episodes that ``max_steps`` cut short or that
         were given up, shape [K, 3]; they are in none of the others
-    :param max_costs: highest cost of a step, by key, shape [E, m]; 0 where none is above it
-    :param limit_on: what of the costs the model's limits bound, their ``"sum"`` or ``"max"``
-    :param limits: the model's limits, one for each cost key; empty if it has none
-    :param cost_keys: the m entries of info that were read as costs
-    :param absent: those of them that no step had
+    :param absent: cost keys that no step had
+    :param copies: whether environments that were seeded differently played the same episode
     """
 
     returns: np.ndarray
     costs: np.ndarray
     lengths: np.ndarray
     key_costs: np.ndarray
+    max_costs: np.ndarray
+    limits: Limits
     successes: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
     unfinished: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    max_costs: np.ndarray = field(default_factory=lambda: np.zeros((0, 1)))
-    limit_on: str = "sum"
-    limits: tuple[float, ...] = ()
-    cost_keys: tuple[str, ...] = ("cost",)
     absent: tuple[str, ...] = ()
+    copies: bool = False
 
     def __len__(self) -> int:
         return len(self.returns)
 
     def __str__(self) -> str:
-        returns, costs = self.estimate(self.returns), self.estimate(self.costs)
-        text = f"{len(self)} episodes: return {returns}, cost {costs}"
-        if not self.limits:
-            text += beside(costs.diverged)
-        if self.limit_on == "sum" and len(self.cost_keys) == 1:
-            return text + "".join(f", {costs.against(limit)}" for limit in self.limits)
-        return text + "".join(
-            f"; {name} {cost}" + ("" if limit is None else f", {cost.against(limit)}")
-            for name, (cost, limit) in self.by_key().items()
-        )
+        return f"{len(self)} episodes: {self.words}"
 
-    def by_key(self) -> dict[str, tuple[Estimate, float | None]]:
-        """Of each cost key what a limit bounds, and the limit: None if the model has none."""
-        names = [bounded_name(key, self.limit_on) for key in self.cost_keys]
-        limits = self.limits or (None,) * len(names)
-        costs = map(estimate, self.limited.T)
-        return dict(zip(names, zip(costs, limits, strict=True), strict=True))
+    @property
+    def words(self) -> str:
+        """Mean return and costs, ± their standard errors, and the limits."""
+        words = [f"return {Mean.of(self.returns)}"]
+        if self.limits.on == "max" or len(self.limits.keys) > 1:
+            words.append(f"cost {Mean.of(self.costs)}")
+        limited = self.limits.described(self.limited).items()
+        return ", ".join([*words, *(f"{name} {cost}" for name, cost in limited)])
+
+    @property
+    def cost_keys(self) -> tuple[str, ...]:
+        """The m entries of info that were read as costs."""
+        return self.limits.keys
 
     @property
     def limited(self) -> np.ndarray:
-        """What the model's limits bound, of each episode and cost key, shape [E, m]."""
-        return self.max_costs if self.limit_on == "max" else self.key_costs
+        """The part of each episode's costs that the model's limits bound, shape [E, m]."""
+        return self.max_costs if self.limits.on == "max" else self.key_costs
 
     @property
     def worst(self) -> np.ndarray:
         """Highest cost of a step of any key, shape [E]."""
         return self.max_costs.max(axis=1)
 
-    estimate = staticmethod(estimate)
+    @property
+    def whole(self) -> bool:
+        """Whether every episode that was asked for has come to its end, and its cost is known."""
+        return len(self) > 1 and not len(self.unfinished) and not np.isnan(self.limited).any()
 
 
 def sync_normalization(env: VecEnv, eval_env: VecEnv) -> None:
@@ -120,7 +118,7 @@ def sync_normalization(env: VecEnv, eval_env: VecEnv) -> None:
     :param eval_env: evaluation environment
     :raises ValueError: the evaluation environment is not normalised, but training is
     """
-    training, evaluation = unwrap_vec_normalize(env), unwrap_vec_normalize(eval_env)
+    training, evaluation = normalizer_of(env), normalizer_of(eval_env)
     if training is None:
         return
     if evaluation is None:
@@ -152,7 +150,7 @@ def check_agent(model: Any, env: VecEnv) -> None:
                     f"the agent can't act: its weights {name!r} are not finite; take an earlier "
                     "model, or train it again with a lower learning_rate"
                 )
-    normalizer = unwrap_vec_normalize(env)
+    normalizer = normalizer_of(env)
     if normalizer is not None:
         check_normalizer(normalizer, normalizer.venv.observation_space)
 
@@ -172,50 +170,36 @@ def check_normalizer(normalizer: Any, space: spaces.Space) -> None:
     if not normalizer.norm_obs:
         return
     several = isinstance(space, spaces.Dict)
-    entries: Any = space.spaces if isinstance(space, spaces.Dict) else {None: space}
+    entries: Any = space.spaces if isinstance(space, spaces.Dict) else {"": space}
     zeros = {name: np.zeros(entry.shape or ()) for name, entry in entries.items()}
     try:
         with np.errstate(all="ignore"):
-            seen: Any = normalizer.normalize_obs(zeros if several else zeros[None])
+            seen: Any = normalizer.normalize_obs(zeros if several else zeros[""])
     except Exception as error:
         fault = f"{type(error).__name__}: {error}"
         raise ValueError(f"observation statistics do not fit {space}: {fault}") from None
-    for name, values in (seen if several else {None: seen}).items():
-        if np.shape(values) != zeros[name].shape or not np.isfinite(values).all():
-            of = "" if name is None else f" of {name!r}"
+    moments = moments_of(normalizer)
+    for name, values in (seen if several else {"": seen}).items():
+        part = moments.get(name, RunningMeanStd(shape=zeros[name].shape))
+        shapes = {np.shape(numbers) for numbers in (values, part.mean, part.var)}
+        sound = np.isfinite(values).all() and np.all(part.var > 0.0)
+        if shapes != {zeros[name].shape} or not sound:
+            of = f" of {name!r}" if name else ""
             raise ValueError(
                 f"observation statistics do not fit {space}: means and variances{of} have another "
-                "shape, or are not finite"
+                "shape, or are not finite, or a variance is not above 0"
             )
 
 
 def share_environment(one: VecEnv, other: VecEnv) -> bool:
     """Whether to reset one of two vectorised environments resets something of the other, too."""
-    parts: list[set[int]] = []
-    for env in (one.unwrapped, other.unwrapped):
-        inner = getattr(env, "envs", [])  # a list of single environments, or one batch
+
+    def parts(env: VecEnv) -> set[int]:
+        inner = getattr(env.unwrapped, "envs", [])  # a list of single environments, or one batch
         inner = inner if isinstance(inner, list) else [inner]
-        parts.append({id(env), *(id(part.unwrapped) for part in inner)})
-    return not parts[0].isdisjoint(parts[1])
+        return {id(env.unwrapped), *(id(part.unwrapped) for part in inner)}
 
-
-def moments_of(env: VecEnv | None) -> dict[str, RunningMeanStd]:
-    """What normalises observations, by their entries (``""``: they have none); empty: nothing."""
-    normalizer = None if env is None else unwrap_vec_normalize(env)
-    if normalizer is None or not normalizer.norm_obs:
-        return {}
-    moments = normalizer.obs_rms
-    return moments if isinstance(moments, dict) else {"": moments}
-
-
-def lacks_statistics(model: Any, env: VecEnv | None) -> bool:
-    """Whether an agent learnt from normalised observations, and ``env`` has no means of them."""
-    learnt_with = model.get_vec_normalize_env() if isinstance(model, BaseAlgorithm) else None
-    if not getattr(model, "learnt_normalized", learnt_with is not None and learnt_with.norm_obs):
-        return False
-    moments = moments_of(env)
-    # Those of a new VecNormalize are of no observation.
-    return not moments or any(part.count < 1 for part in moments.values())
+    return not parts(one).isdisjoint(parts(other))
 
 
 @contextmanager
@@ -224,9 +208,9 @@ def _constant_normalization(model: PolicyPredictor, env: VecEnv) -> Iterator[Non
 
     :raises ValueError: the model's own environment normalises observations, and this one nothing
     """
-    learnt_with = model.get_vec_normalize_env() if isinstance(model, BaseAlgorithm) else None
-    normalizer = unwrap_vec_normalize(env)
-    if normalizer is None and learnt_with is not None and learnt_with.norm_obs:
+    normalizer = normalizer_of(env)
+    learnt_with = moments_of(model.get_env()) if isinstance(model, BaseAlgorithm) else None
+    if normalizer is None and learnt_with:
         raise ValueError(
             "the model learnt from normalised observations, and env has no VecNormalize: "
             "evaluate it in model.get_env(), or wrap env in VecNormalize and call "
@@ -238,6 +222,8 @@ def _constant_normalization(model: PolicyPredictor, env: VecEnv) -> Iterator[Non
             "unless it normalises them in another way, these are not its return and cost",
             stacklevel=4,
         )
+    if fault := own_statistics(env):
+        warnings.warn(fault, stacklevel=4)
     if normalizer is None:
         yield
         return
@@ -246,18 +232,6 @@ def _constant_normalization(model: PolicyPredictor, env: VecEnv) -> Iterator[Non
         yield
     finally:
         normalizer.training = training
-
-
-def limits_on(model: Any, keys: Sequence[str]) -> tuple[float, ...]:
-    """The model's limits on these costs; empty if it has none."""
-    if isinstance(model, Constrained) and model.constrained and keys == tuple(model.cost_keys):
-        return tuple(model.final_cost_limits.tolist())
-    return ()
-
-
-def shares(n_episodes: int, n_envs: int) -> np.ndarray:
-    """How many of the episodes each environment plays, shape [n_envs]."""
-    return np.array([(n_episodes + i) // n_envs for i in range(n_envs)])
 
 
 def evaluate_policy(
@@ -275,8 +249,9 @@ def evaluate_policy(
     """
     Play whole episodes and report return and cost of each.
 
-    Each row of a vectorised environment plays its own share of the episodes, fixed beforehand. To
-    take the first ones that end, from any row, would favour short episodes.
+    The rows of a vectorised environment begin together, and when all have played an episode, again.
+    To take the first episodes that end, from any row, would favour short ones. With a seed, the
+    i-th episode begins with ``seed + i``.
 
     Returns and lengths are those of a monitor wrapper where there is one, so that reward
     normalisation outside it does not show. Costs are read as the model reads them in training,
@@ -288,8 +263,8 @@ def evaluate_policy(
     sb3-contrib's MaskablePPO, is given those of environments that have the method.
 
     A model's own training environment will do: if ``learn`` is called again, it begins new
-    episodes. In a callback, which runs during ``learn``, evaluate in another environment. The
-    statistics of ``VecNormalize`` stay as they are.
+    episodes. During a rollout, as in a callback, it is refused. The statistics of
+    ``VecNormalize`` stay as they are.
 
     :param model: anything with ``predict``: an algorithm or a policy
     :param env: a single or a vectorised environment; it is reset first
@@ -307,7 +282,8 @@ def evaluate_policy(
     :param on_step: called after each step, e.g. to render
     :param on_episode: called with return, cost and length of each counted episode as it ends
     :raises ValueError: ``n_eval_episodes`` is below 1, a cost is not finite or missing where it
-        must not be, or the model's own environment normalises observations and ``env`` nothing
+        must not be, ``env`` is the environment of a training that is under way, or the model's own
+        environment normalises observations and ``env`` nothing
     """
     if n_eval_episodes < 1:
         raise ValueError(f"n_eval_episodes must be at least 1, not {n_eval_episodes}")
@@ -319,54 +295,78 @@ def evaluate_policy(
     zero_if_missing = getattr(model, "missing_cost", "zero") == "zero"
     policy = getattr(model, "policy", model)
     acts_on_cost = getattr(policy, "acts_on_cost", False)
-    if isinstance(model, Constrained) and model.env is not None:
-        model.begin_anew |= share_environment(model.env, env)
+    if isinstance(model, Constrained) and model.env and share_environment(model.env, env):
+        if model.collecting:
+            raise ValueError(BROKEN_OFF)
+        model._last_obs = None  # so the next learn begins new episodes, as after set_env
 
-    longest = _longest_episode(env) if max_steps is None else None
+    # steps after which an episode is given up
+    longest = int(max([LONGEST, *step_limits(env)])) if max_steps is None else None
     tally = _Tally(env, n_eval_episodes, keys, on_episode, longest)
-    # sampled actions are drawn from the seed, and torch's generators stay as they were
-    with _constant_normalization(model, env), th.random.fork_rng(enabled=seed is not None):
+    # sampled actions are drawn from the seed, and the generators that draw them stay as they were
+    device = th.device(getattr(model, "device", "cpu"))
+    forked = th.random.fork_rng([device] if device.type == "cuda" else [], seed is not None)
+    with _constant_normalization(model, env), _constant_mode(policy), forked:
         if seed is not None:
             th.manual_seed(seed)
-            env.seed(seed)
-        observations = env.reset()
-        starts = np.ones(env.num_envs, dtype=bool)
-        state: tuple[np.ndarray, ...] | None = None
-        last_costs = np.zeros((env.num_envs, len(keys)))
         steps = 0
-        while tally.left.any() and (max_steps is None or steps < max_steps):
-            actions, state = model.predict(
-                observations,  # type: ignore[arg-type]
-                state=(last_costs,) if acts_on_cost else state,
-                episode_start=starts,
-                deterministic=deterministic,
-                **({"action_masks": np.stack(env.env_method("action_masks"))} if masked else {}),
-            )
-            observations, rewards, starts, infos = env.step(actions)
-            steps += 1
-            last_costs, _ = read_costs(infos, keys, zero_if_missing, tally.costs.lengths)
-            if on_step is not None:
-                on_step()
-            tally.step(rewards, last_costs, starts, infos)
-            last_costs[np.flatnonzero(starts)] = 0.0
-    return tally.evaluation(getattr(model, "limit_on", "sum"), limits_on(model, keys))
+        while tally.asked and (max_steps is None or steps < max_steps):
+            if seed is not None:
+                env.seed(seed + len(tally.ended))
+            observations = env.reset()
+            tally.begin(observations)
+            starts = np.ones(env.num_envs, dtype=bool)
+            state: tuple[np.ndarray, ...] | None = None
+            last_costs = np.zeros((env.num_envs, len(keys)))
+            while tally.playing.any() and (max_steps is None or steps < max_steps):
+                actions, state = model.predict(
+                    observations,  # type: ignore[arg-type]
+                    state=(last_costs,) if acts_on_cost else state,
+                    episode_start=starts,
+                    deterministic=deterministic,
+                    **(
+                        {"action_masks": np.stack(env.env_method("action_masks"))} if masked else {}
+                    ),
+                )
+                observations, rewards, starts, infos = env.step(actions)
+                steps += 1
+                last_costs, _ = read_costs(infos, keys, zero_if_missing, tally.costs.lengths)
+                if on_step is not None:
+                    on_step()
+                tally.step(rewards, last_costs, starts, infos)
+                last_costs[np.flatnonzero(starts)] = 0.0
+            tally.end()
+    return tally.evaluation(Limits.of(model, keys))
 
 
-def _longest_episode(env: VecEnv) -> int:
-    """Steps after which an episode is given up."""
-    limits: list[Any] = []
-    for name in ("_max_episode_steps", "max_episode_steps"):  # of TimeLimit, and of our batches
-        with suppress(NotImplementedError):  # a vectorised environment need not tell
-            limits += env.get_attr(name) if env.has_attr(name) else []
-    return max([LONGEST, *(int(limit) for limit in limits if is_number(limit))])
+@contextmanager
+def _constant_mode(policy: Any) -> Iterator[None]:
+    """Set a policy to evaluation once; its ``predict`` would walk over its modules in each step."""
+    if not isinstance(policy, th.nn.Module) or not hasattr(policy, "set_training_mode"):
+        yield
+        return
+    policy.set_training_mode(False)
+    object.__setattr__(policy, "set_training_mode", lambda mode: None)
+    try:
+        yield
+    finally:
+        object.__delattr__(policy, "set_training_mode")
+
+
+def _prints(observations: Any) -> list[int]:
+    """A number for each row of observations, the same for the same observation."""
+    parts = observations.values() if isinstance(observations, dict) else [observations]
+    rows = zip(*(np.ascontiguousarray(part) for part in parts), strict=True)
+    return [hash(tuple(part.tobytes() for part in row)) for row in rows]
 
 
 class _Tally:
     """
     Return, costs and steps of the episodes of vectorised environments, under way and ended.
 
-    :param left: episodes that each environment has still to play, shape [n]
-    :param longest: steps after which an episode is given up; None: never
+    :param asked: episodes that are still to be begun
+    :param longest: steps after which an episode is given up, and those that were to follow; None:
+        never
     """
 
     def __init__(
@@ -377,17 +377,43 @@ class _Tally:
         on_episode: Callable[[float, float, int], Any] | None,
         longest: int | None,
     ) -> None:
-        n = env.num_envs
+        self.env = env
         self.keys, self.on_episode, self.longest = keys, on_episode, longest
-        self.monitored = is_vecenv_wrapped(env, VecMonitor) or env.env_is_wrapped(Monitor)[0]
-        self.asked = n_eval_episodes
-        self.left = shares(n_eval_episodes, n)
-        self.returns = np.zeros(n)
-        self.costs = EpisodeCosts(n, len(keys) + 1)  # each of the keys, then all costs
-        self.ended: list[tuple[float, int, EpisodeCost]] = []  # return, steps, costs
+        self.monitored = env.env_is_wrapped(Monitor)[0]
+        normalizer = normalizer_of(env)
+        #: VecNormalize where it changes rewards; returns that a monitor outside of it reports are
+        #: of changed ones
+        self.changing = normalizer if normalizer and normalizer.norm_reward else None
+        kinds = (layer for layer in layers(env) if isinstance(layer, VecMonitor | VecNormalize))
+        self.reported = not (self.changing and isinstance(next(kinds), VecMonitor))
+        self.asked = self.wanted = n_eval_episodes
+        #: return, steps and costs of the episodes that have ended
+        self.ended: list[tuple[float, int, EpisodeCost]] = []
         self.unfinished: list[np.ndarray] = []
         self.successes: list[bool] = []
         self.absent = {*keys}  # costs that no step has reported
+        self.different: set[tuple[Any, ...]] = set()  # episodes, as far as they differ
+        self.copies = True
+
+    def begin(self, observations: Any) -> None:
+        """An episode begins in every environment; those that are asked for count."""
+        n = self.env.num_envs
+        self.playing = np.arange(n) < self.asked
+        self.asked = max(self.asked - n, 0)
+        self.returns = np.zeros(n)
+        self.costs = EpisodeCosts(n, len(self.keys) + 1)  # each of the keys, then all costs
+        self.first, self.over = _prints(observations), list[tuple[float, int, EpisodeCost]]()
+        if n > 1:
+            self.different = set()
+
+    def end(self) -> None:
+        """All episodes that began together have ended, or steps are used up."""
+        self.unfinished.append(self._under_way(self.playing & (self.costs.lengths > 0)))
+        self.over.sort(key=lambda episode: episode[2].row)
+        self.ended += self.over
+        for earned, steps, cost in self.over:
+            self.different.add((self.first[cost.row], earned, steps, *cost.total.tolist()))
+        self.copies &= len(self.different) == 1
 
     def step(
         self,
@@ -397,7 +423,7 @@ class _Tally:
         infos: list[dict[str, Any]],
     ) -> None:
         """Add a step of every environment, and the episodes that it ends; give up endless ones."""
-        self.returns += rewards
+        self.returns += rewards if self.changing is None else self.changing.get_original_reward()
         if self.absent:
             self.absent.difference_update(*infos)
         if len(self.keys) == 1:
@@ -405,47 +431,50 @@ class _Tally:
         else:
             totals = np.array([[total_cost(info, self.keys)] for info in infos])
         over = np.array(dones, dtype=bool)
-        for i in np.flatnonzero(dones):
-            over[i] = self._is_over(infos[i])
+        for i in np.flatnonzero(dones).tolist():
+            over[i] = self._is_over(i, infos[i])
         for cost in self.costs.step(np.hstack([costs, totals]), over):
             self._end(cost, infos[cost.row])
         if self.longest is not None:
-            rows = (self.left > 0) & (self.costs.lengths >= self.longest)
-            if rows.any():
-                self.unfinished.append(self._under_way(rows))
-                self.left[rows] = 0
+            endless = self.playing & (self.costs.lengths >= self.longest)
+            if endless.any():
+                self.unfinished.append(self._under_way(endless))
+                self.playing[endless] = False
+                self.asked = 0
 
     def _under_way(self, rows: np.ndarray) -> np.ndarray:
         """Return, cost and steps so far of some rows, shape [K, 3]."""
         lengths = self.costs.lengths
         return np.stack([self.returns, self.costs.totals[:, -1], lengths], axis=1)[rows]
 
-    def _is_over(self, info: dict[str, Any]) -> bool:
+    def _is_over(self, row: int, info: dict[str, Any]) -> bool:
         """Whether an episode that a step ended has come to its true end.
 
-        That of one cut by a wrapper outside the monitor (a life lost, in Atari) is still to come,
-        unless the wrapper is EarlyTermination.
+        Where a wrapper outside Monitor has ended it, it goes on if Monitor has not been reset, as
+        after a life lost in Atari.
         """
-        return not self.monitored or "episode" in info or "budget_exceeded" in info
+        reset = not self.monitored or "episode" in info
+        return reset or not self.env.get_attr("rewards", [row])[0]
 
     def _end(self, cost: EpisodeCost, info: dict[str, Any]) -> None:
         """Count an episode that is over, if one is still to be played."""
         i = cost.row
-        if self.left[i]:
-            self.left[i] -= 1
+        if self.playing[i]:
+            self.playing[i] = False
             earned, steps = float(self.returns[i]), cost.length
-            episode = info.get("episode")
-            if episode is not None:
+            episode = info.get("episode") if self.reported else None
+            # Other steps than Monitor's are of several episodes, some ended by a wrapper outside.
+            if episode is not None and (self.monitored or episode["l"] == steps):
                 earned, steps = float(episode["r"]), int(episode["l"])
             cost = cost.known(info)
-            self.ended.append((earned, steps, cost))
+            self.over.append((earned, steps, cost))
             if "is_success" in info:
                 self.successes.append(bool(info["is_success"]))
             if self.on_episode is not None:
                 self.on_episode(earned, float(cost.total[-1]), steps)
         self.returns[i] = 0.0
 
-    def evaluation(self, limit_on: str, limits: tuple[float, ...]) -> Evaluation:
+    def evaluation(self, limits: Limits) -> Evaluation:
         """What was seen."""
         if self.keys != ("cost",) and self.absent == {*self.keys} and not limits:
             warnings.warn(
@@ -453,26 +482,24 @@ class _Tally:
                 "the monitor's, name the entries of info that are costs",
                 stacklevel=3,
             )
-        absent = self.asked - len(self.ended)
+        absent = self.wanted - len(self.ended)
         if absent and self.longest is not None:
             warnings.warn(
-                f"{absent} of {self.asked} episodes are left out: one had not ended after "
+                f"{absent} of {self.wanted} episodes are left out: one had not ended after "
                 f"{self.longest:,} steps; limit their length, with gymnasium.wrappers.TimeLimit("
                 "env, 1000) or, in commands, --env-kwargs max_episode_steps:1000",
                 stacklevel=3,
             )
         shape = len(self.ended), len(self.keys)
-        left = self._under_way((self.left > 0) & (self.costs.lengths > 0))
         return Evaluation(
             returns=np.array([earned for earned, _, _ in self.ended]),
             costs=np.array([cost.total[-1] for _, _, cost in self.ended]),
             lengths=np.array([steps for _, steps, _ in self.ended], dtype=np.int64),
             key_costs=np.array([cost.total[:-1] for _, _, cost in self.ended]).reshape(shape),
-            successes=np.array(self.successes, dtype=bool),
-            unfinished=np.concatenate([*self.unfinished, left]),
             max_costs=np.array([cost.highest[:-1] for _, _, cost in self.ended]).reshape(shape),
-            limit_on=limit_on,
             limits=limits,
-            cost_keys=self.keys,
+            successes=np.array(self.successes, dtype=bool),
+            unfinished=np.concatenate(self.unfinished),
             absent=tuple(key for key in self.keys if key in self.absent),
+            copies=self.copies and len(self.ended) > 1,
         )

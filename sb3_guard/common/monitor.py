@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.monitor import ResultsWriter
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor, is_vecenv_wrapped
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor, is_vecenv_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_guard.checks import NumberError, check_cost_keys
 from sb3_guard.common.vec_budgets import end_rows
 from sb3_guard.costs import EpisodeCost, EpisodeCosts, number, read_costs
+from sb3_guard.vector import layers
 
 
 def total_cost(info: Mapping[str, Any], cost_keys: Sequence[str] = ("cost",)) -> float:
@@ -202,11 +203,9 @@ def _require_finite(name: str, values: VecEnvObs) -> None:
 
 def find_monitor(env: VecEnv) -> CostMonitor:
     """The cost monitor among an environment's wrappers."""
-    layer = env
-    while isinstance(layer, VecEnvWrapper):
+    for layer in layers(env):
         if isinstance(layer, CostMonitor):
             return layer
-        layer = layer.venv
     raise ValueError("the environment is not wrapped in a CostMonitor")
 
 

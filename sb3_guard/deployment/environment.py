@@ -5,7 +5,9 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecFrameStack
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack
+
+from sb3_guard.vector import layers
 
 
 class Drive(NamedTuple):
@@ -31,13 +33,6 @@ def drive(env: VecEnv) -> Drive | None:
     return Drive(ours.actuators, offset[0], (at_one - offset)[0])
 
 
-def vec_wrappers(env: VecEnv) -> Iterator[VecEnvWrapper]:
-    """The wrappers of vectorised environments, from the outermost to the innermost."""
-    while isinstance(env, VecEnvWrapper):
-        yield env
-        env = env.venv
-
-
 def ours_of(env: VecEnv) -> Any:
     """The environments if they are this package's: who knows the engine and its components."""
     base = lone_of(env) or getattr(env.unwrapped, "envs", None)
@@ -50,14 +45,11 @@ def lone_of(env: VecEnv) -> gymnasium.Env | None:
     return env.unwrapped.envs[0] if isinstance(env.unwrapped, DummyVecEnv) else None
 
 
-def all_wrappers(env: VecEnv) -> Iterator[Any]:
+def all_wrappers(env: VecEnv) -> list[Any]:
     """All wrappers, from the innermost to the outermost."""
-    lone, inner = lone_of(env), []
-    while isinstance(lone, gymnasium.Wrapper):
-        inner.append(lone)
-        lone = lone.env
-    yield from reversed(inner)
-    yield from reversed(list(vec_wrappers(env)))
+    *outer, _ = layers(env)
+    *inner, _ = layers(lone_of(env))
+    return [*outer, *inner][::-1]
 
 
 def changing(env: VecEnv) -> Iterator[Any]:
@@ -72,5 +64,5 @@ def changing(env: VecEnv) -> Iterator[Any]:
 
 def frames_of(env: VecEnv) -> int:
     """How many frames an observation stacks."""
-    stacks = [w for w in vec_wrappers(env) if isinstance(w, VecFrameStack)]
+    stacks = [w for w in layers(env) if isinstance(w, VecFrameStack)]
     return int(np.prod([w.stacked_obs.n_stack for w in stacks]))

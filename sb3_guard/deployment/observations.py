@@ -1,6 +1,7 @@
 """What an exported policy is given: its inputs by name, and how they are normalised."""
 
 from collections.abc import Mapping
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from stable_baselines3.common.vec_env import (
 )
 from torch import nn
 
-from sb3_guard.deployment.environment import vec_wrappers
+from sb3_guard.vector import layers, normalizer_of
 
 #: The name of an observation that is not a dictionary.
 OBSERVATION = "observation"
@@ -38,12 +39,10 @@ class Normalizer(nn.Module):
         super().__init__()
         self.names: list[str] = []
         self.clip = np.inf
-        outside: list[VecEnvWrapper] = []
-        for wrapper in vec_wrappers(env):
-            if isinstance(wrapper, VecNormalize):
-                self._take(wrapper, outside[::-1])
-                return
-            outside.append(wrapper)
+        normalizer = normalizer_of(env)
+        if normalizer is not None:
+            outside = [*takewhile(lambda layer: layer is not normalizer, layers(env))]
+            self._take(normalizer, outside[::-1])
 
     def _take(self, normalize: VecNormalize, outside: list[VecEnvWrapper]) -> None:
         """Take over the statistics, in the layout that wrappers from inside to outside make."""

@@ -17,12 +17,13 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_guard.common.evaluation import check_agent, lacks_statistics
+from sb3_guard.common.evaluation import check_agent
 from sb3_guard.common.files import replacing
 from sb3_guard.deployment.contract import contract, stops
 from sb3_guard.deployment.deployed import Deployed
 from sb3_guard.deployment.observations import inputs_of, joined
 from sb3_guard.deployment.policies import Acting
+from sb3_guard.vector import lacks_statistics, own_statistics
 
 if TYPE_CHECKING:
     import onnx
@@ -79,6 +80,8 @@ def export(
             "the agent has no environment, or one without its observation statistics: pass env=, "
             "environments wrapped as in training (with VecNormalize.load(file, env), if it had any)"
         )
+    if (fault := own_statistics(env)).startswith("NormalizeObservation"):
+        raise ValueError(fault)
     check_agent(model, env)
     stops(model, env, stop or {})
     deployed = Deployed(model, env, sampled)

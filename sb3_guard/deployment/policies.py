@@ -103,7 +103,10 @@ class Deterministic(Actor):
 
 def _output(policy: Any, observations: PyTorchObs) -> th.Tensor:
     """Means or logits, [B, k]."""
-    features = policy.extract_features(observations, policy.pi_features_extractor)
+    # the actor's alone: where the critic has an extractor of its own, SB3's method returns both
+    features = super(ActorCriticPolicy, policy).extract_features(
+        observations, policy.pi_features_extractor
+    )
     return policy.action_net(policy.mlp_extractor.forward_actor(features))
 
 

@@ -89,6 +89,35 @@ def test_an_agent_of_normalised_observations_says_so(tmp_path):
         evaluate_policy(model, env, 5)
 
 
+def test_a_training_that_goes_on_without_its_statistics_says_so(tmp_path):
+    def venv() -> sb3.common.vec_env.DummyVecEnv:
+        return sb3.common.vec_env.DummyVecEnv([lambda: CostPoint(10)])
+
+    normalize, kwargs = sb3.common.vec_env.VecNormalize, {"n_steps": 40, "cost_limit": 1.0}
+    statistics = normalize(venv())
+    CPO("MlpPolicy", statistics, **kwargs).learn(40).save(tmp_path / "a")
+    statistics.save(str(tmp_path / "s.pkl"))
+
+    def set_env(env: Any) -> CPO:
+        model = CPO.load(tmp_path / "a")
+        model.set_env(env)
+        return model
+
+    begin = [
+        lambda env: CPO.load(tmp_path / "a", env=env),
+        set_env,
+        lambda env: warm_start(CPO("MlpPolicy", env, **kwargs), tmp_path / "a"),
+    ]
+    for begun in begin:
+        with warnings.catch_warnings(action="error"):
+            begun(normalize.load(str(tmp_path / "s.pkl"), venv())).learn(40)
+        for env in (venv(), normalize(venv()), normalize(venv(), norm_obs=False)):
+            with pytest.warns(UserWarning, match=r"normalised .*: wrap it in VecNormalize.load"):
+                model = begun(env).learn(40)
+            with warnings.catch_warnings(action="error"):
+                model.learn(40)
+
+
 RUN = [
     *"--gym-packages registered_envs --env CostPoint-v0 --env-kwargs episode_length:20".split(),
     *"--algo ppo_lag -n 60 --eval-freq -1 --device cpu".split(),

@@ -88,6 +88,7 @@ def test_without_skewness_the_bounds_are_students():
         mean_bounds(-values, 0.05), np.negative(mean_bounds(values, 0.05))[::-1]
     )
     np.testing.assert_allclose(mean_bounds(np.full(30, 7.0), 0.05), (7.0, 7.0))
+    assert np.isfinite(mean_bounds(values, 1e-20)).all()  # 1 - 1e-20 is 1
 
 
 @pytest.mark.parametrize(

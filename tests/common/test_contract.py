@@ -227,7 +227,10 @@ def spoil(normalizer: Any, **values: Any) -> None:
 UNFIT = {
     "another shape": {"mean": np.zeros(3)},
     "nan": {"mean": np.array([0, 0, np.nan, 0])},
+    "broadcast": {"mean": np.zeros(1)},
+    "one variance": {"var": np.ones(())},
     "negative": {"var": -np.ones(4)},
+    "constant": {"var": np.array([1.0, 1.0, 0.0, 1.0])},
     "words": {"mean": np.array(["a"] * 4)},
     "none": {"obs_rms": None},
     "clip": {"clip_obs": np.nan},

@@ -1,6 +1,7 @@
 """Whole episodes, counted fairly, with an honest interval."""
 
 import dataclasses
+import io
 from typing import Any
 
 import gymnasium as gym
@@ -9,9 +10,19 @@ import pytest
 import torch as th
 from cost_envs import CostPoint
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from gymnasium.wrappers import TimeLimit
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    VecEnvWrapper,
+    VecFrameStack,
+    VecMonitor,
+    VecNormalize,
+)
 
-from sb3_guard.algorithms import CPO, TRPOSL
+from sb3_guard.algorithms import CPO, TRPOSL, SACLag
+from sb3_guard.common.certificate import certify
 from sb3_guard.common.evaluation import (
     Evaluation,
     evaluate_policy,
@@ -108,9 +119,65 @@ def test_other_policies_keep_their_own_state_and_see_where_episodes_start():
     assert [one[0] for one in model.starts] == [True, False, True, False]
 
 
-def test_reward_normalisation_does_not_show_through_a_monitor():
-    env = VecNormalize(CostMonitor(fixed(3)))
+@pytest.mark.parametrize("inside", [CostMonitor, None])
+@pytest.mark.parametrize("outside", [CostMonitor, VecMonitor, None])
+def test_reward_normalisation_does_not_show(inside, outside):
+    env = scaled = VecNormalize(inside(fixed(3)) if inside else fixed(3), norm_obs=False)
+    scaled.ret_rms.var = np.array(100.0)
+    env = VecFrameStack(outside(env) if outside else env, 2)
     assert evaluate_policy(Idle(), env, n_eval_episodes=2).returns.tolist() == [3, 3]
+
+
+def test_an_episode_that_a_wrapper_outside_of_monitor_cuts_is_over():
+    def cut(length: int) -> gym.Env:
+        return TimeLimit(Monitor(Fixed(length)), 3)
+
+    seen = evaluate_policy(Idle(), DummyVecEnv([lambda: cut(2), lambda: cut(5)]), 4)
+    assert sorted(seen.lengths.tolist()) == [2, 2, 3, 3] == sorted(seen.returns.tolist())
+    assert sorted(seen.costs.tolist()) == [30, 30, 60, 60]
+    model = CPO("MlpPolicy", cut(5), n_steps=30, n_critic_updates=1).learn(30)
+    assert (model.costs.horizon, model.costs.episode_cost.tolist()) == (3, [60])
+
+
+class Cutting(VecEnvWrapper):
+    """Ends all episodes after two steps, and tells no monitor."""
+
+    def reset(self):
+        self.k = 0
+        return self.venv.reset()
+
+    def step_wait(self):
+        obs, rewards, dones, infos = self.venv.step_wait()
+        self.k += 1
+        if self.k % 2 == 0:
+            self.env_method("reset")
+            dones = np.ones_like(dones)
+        return obs, rewards, dones, infos
+
+
+def test_a_monitor_that_is_not_told_of_an_end_reports_nothing():
+    seen = evaluate_policy(Idle(), Cutting(CostMonitor(fixed(2, 5))), 4)
+    assert seen.lengths.tolist() == seen.returns.tolist() == [2] * 4
+    assert seen.costs.tolist() == [30] * 4
+
+
+class Lives(gym.Wrapper):
+    """Ends an episode after each step, though the game goes on, as SB3's EpisodicLifeEnv."""
+
+    over = True
+
+    def step(self, action):
+        obs, reward, self.over, truncated, info = self.env.step(action)
+        return obs, reward, True, truncated, info
+
+    def reset(self, **kwargs):
+        return self.env.reset(**kwargs) if self.over else (np.zeros(1, np.float32), {})
+
+
+def test_a_life_lost_is_not_the_end():
+    seen = evaluate_policy(Idle(), Lives(Monitor(Fixed(3))), 2)
+    assert seen.lengths.tolist() == seen.returns.tolist() == [3, 3]
+    assert seen.costs.tolist() == [60, 60]
 
 
 @pytest.mark.parametrize("deterministic", [True, False])
@@ -201,6 +268,38 @@ def test_training_goes_on_with_new_episodes_after_an_evaluation_in_its_environme
     assert model.costs.episodes.lengths.tolist() == [20]  # once is enough
 
 
+@pytest.mark.parametrize("algorithm", [CPO, SACLag])
+@pytest.mark.parametrize("moment", ["training_start", "rollout_start", "step", "rollout_end"])
+def test_an_evaluation_in_the_training_environment_is_refused_while_it_trains(algorithm, moment):
+    env = CostPoint(10)
+    steps = {"n_steps": 20} if algorithm is CPO else {"learning_starts": 5, "batch_size": 8}
+    model = algorithm("MlpPolicy", env, **steps)
+
+    class Evaluating(BaseCallback):
+        def _on_step(self) -> bool:
+            return True
+
+    play = lambda *_: evaluate_policy(model, env, 1)  # noqa: E731
+    setattr(Evaluating, f"_on_{moment}", play)
+    with pytest.raises(ValueError, match="eval_env is the training environment, whose episodes"):
+        model.learn(40, callback=Evaluating())
+    setattr(Evaluating, f"_on_{moment}", lambda *_: True)
+    Evaluating._on_training_end = play
+    model.learn(40, callback=Evaluating()).learn(0)
+    model.save(path := io.BytesIO())
+    path.seek(0)
+    assert len(play()) == len(evaluate_policy(algorithm.load(path, env=env), env, 1)) == 1
+
+
+def test_a_seeded_evaluation_wakes_no_other_gpu(monkeypatch):
+    """fork_rng takes the states of all GPUs unless it is told which."""
+    monkeypatch.setattr(th.cuda, "device_count", lambda: 4)
+    monkeypatch.setattr(th.cuda, "get_rng_state", lambda gpu: pytest.fail(f"GPU {gpu} is used"))
+    model = CPO("MlpPolicy", CostPoint(10), n_steps=20, device="cpu")
+    for agent in (model, model.policy, Idle()):
+        assert len(evaluate_policy(agent, CostPoint(5), 1, seed=0))
+
+
 def test_a_policy_of_several_costs_is_told_their_names():
     keys = ("cost", "cost_1")
     env = DummyVecEnv([lambda: CostPoint(10, cost_keys=keys)])
@@ -257,6 +356,32 @@ def test_an_evaluation_leaves_the_normalization_as_it_is():
         rows.append(evaluate_policy(model, model.get_env(), 4, seed=3).returns)
     assert env.training and env.obs_rms.count == count
     np.testing.assert_array_equal(*rows)
+
+
+def test_a_second_normalizer_is_refused():
+    def two() -> VecNormalize:
+        return VecNormalize(CostMonitor(VecNormalize(DummyVecEnv([lambda: CostPoint(10)]))))
+
+    model = CPO("MlpPolicy", CostPoint(10), n_steps=20)
+    for use in (
+        lambda: CPO("MlpPolicy", two()),
+        lambda: model.set_env(two()),
+        lambda: evaluate_policy(model.policy, two()),
+        lambda: certify(model.policy, two(), 1.0),
+        lambda: sync_normalization(two(), two()),
+    ):
+        with pytest.raises(ValueError, match=r"env has two VecNormalize.*: keep one"):
+            use()
+
+
+@pytest.mark.parametrize("name", ["NormalizeObservation", "NormalizeReward"])
+def test_wrappers_with_statistics_of_their_own_are_named(name):
+    env = DummyVecEnv([lambda: getattr(gym.wrappers, name)(CostPoint(10))])
+    model = CPO("MlpPolicy", CostPoint(10), n_steps=20)
+    with pytest.warns(UserWarning, match=f"^{name} moves its statistics .*: use VecNormalize"):
+        evaluate_policy(model, env, 1)
+    with pytest.raises(ValueError, match=f"^{name} moves its statistics"):
+        certify(model, env, 1.0)
 
 
 def test_an_agent_of_normalized_observations_is_not_given_raw_ones():

@@ -268,8 +268,9 @@ def test_evaluations_take_them_and_know_the_models_own():
     assert watcher.last_mean_cost > 0.0
     shared = Batch()
     other = PPOLag("MlpPolicy", shared, missing_cost="zero", n_steps=20, cost_limit=1.0)
+    assert other.learn(20)._last_obs is not None
     evaluate_policy(other, shared, 2)
-    assert other.begin_anew
+    assert other._last_obs is None  # so the next learn begins new episodes
 
 
 def test_budgets_end_episodes_of_some_rows():

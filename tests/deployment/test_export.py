@@ -4,6 +4,7 @@ import hashlib
 import json
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import pytest
 import torch as th
 from cost_envs import CostPoint, RandomCostEnv
 from gymnasium import spaces
+from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 from robot_models import DOG, add_pose, add_servos
 from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
@@ -369,6 +371,23 @@ def test_what_can_not_be_exported_is_refused_in_a_line(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="or one without its observation statistics: pass env="):
         sb3_guard.export(normalised, tmp_path / "policy.onnx", env=points(2, normalize=False))
     assert not any(tmp_path.iterdir())
+
+
+def test_an_extractor_for_the_actor_alone_is_exported(tmp_path: Path) -> None:
+    model = trained("ppo_lag", policy_kwargs={"share_features_extractor": False})
+    sb3_guard.export(model, tmp_path / "policy.onnx")
+    share, largest = parity(model, tmp_path / "policy.onnx")
+    assert share == 1.0, largest
+
+
+def test_statistics_that_the_file_would_not_have_are_refused(tmp_path: Path) -> None:
+    model = CPO("MlpPolicy", points(2, normalize=False), **ON_POLICY)
+    for wrapper, fits in ((NormalizeReward, True), (NormalizeObservation, False)):
+        env = make_vec_env(lambda wrapper=wrapper: wrapper(CostPoint(30)), 2)
+        with nullcontext() if fits else pytest.raises(ValueError, match=r"^NormalizeObservation"):
+            sb3_guard.export(model, tmp_path / "policy.onnx", env=env)
+    with pytest.raises(ValueError, match="two VecNormalize"):
+        sb3_guard.export(model, tmp_path / "policy.onnx", env=VecNormalize(points(2)))
 
 
 def test_the_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -236,9 +236,22 @@ def test_enjoy_normalises_as_training_did(tmp_path, capsys):
     statistics.save(str(path))
     assert enjoy.main(play) == 0
     assert capsys.readouterr().out != before
+    statistics.norm_obs = False
+    statistics.save(str(path))
+    assert enjoy.main(play) == 2
+    assert "statistics lack some that normalize asks for" in capsys.readouterr().err
     path.unlink()
     assert enjoy.main(play) == 2
     assert "can't read the observation statistics" in capsys.readouterr().err
+
+
+def test_a_normalizer_among_the_wrappers_is_refused(tmp_path, capsys):
+    wrapper = "vec_env_wrapper:stable_baselines3.common.vec_env.VecNormalize"
+    assert (
+        train.main([*TOY, "-f", str(tmp_path), "-n", "60", "-params", "cost_limit:1.0", wrapper])
+        == 2
+    )
+    assert "VecNormalize in vec_env_wrapper: use normalize" in capsys.readouterr().err
 
 
 def test_processes_of_environments_see_no_interrupt():

@@ -30,7 +30,7 @@ from sb3_guard.checks import check_cost_keys
 from sb3_guard.costs import read_costs
 from sb3_guard.judging import Limits
 from sb3_guard.lost_costs import refuse_lost_costs
-from sb3_guard.vector import as_vec_env
+from sb3_guard.vector import as_vec_env, lacks_statistics, moments_of, normalizer_of
 
 
 class Constrained(BaseAlgorithm):
@@ -112,8 +112,8 @@ class Constrained(BaseAlgorithm):
 
         #: limits, episodes, J_C, T and violations, see :class:`Costs`
         self.costs: Costs = None  # type: ignore[assignment]
-        # Somebody else has reset the environments, so the next `learn` begins new episodes.
-        self.begin_anew = False
+        #: whether a rollout is under way, so that nobody else may step the environments
+        self.collecting = False
         self.timing: dict[str, float] = {}
         super().__init__(*args, **kwargs)
 
@@ -138,7 +138,9 @@ class Constrained(BaseAlgorithm):
         """Take Gymnasium's vector environments, too."""
         if isinstance(env, VectorEnv):
             env = VecMonitor(as_vec_env(env)) if monitor_wrapper else as_vec_env(env)
-        return BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        env = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        normalizer_of(env)  # refuses a second one
+        return env
 
     def _check_hyperparameters(self) -> None:
         """Refuse values that could only fail later or silently do harm."""
@@ -168,7 +170,7 @@ class Constrained(BaseAlgorithm):
         """Say which buffer SB3 is to make, and what it has to know of the costs."""
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "step_costs", "_warned"]
+        return [*super()._excluded_save_params(), "step_costs", "_warned", "collecting"]
 
     # Limits
 
@@ -213,10 +215,14 @@ class Constrained(BaseAlgorithm):
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
         refuse_lost_costs(self.env)
-        normalizer = self.get_vec_normalize_env()
-        self.learnt_normalized = normalizer is not None and normalizer.norm_obs
-        if self.begin_anew:
-            self._last_obs, self.begin_anew = None, False
+        if lacks_statistics(self, self.env):
+            self._warn_once(
+                "statistics",
+                "the agent learnt from normalised observations, and env has no VecNormalize of "
+                "theirs: wrap it in VecNormalize.load(file, env), or what the agent has learnt is "
+                "of other observations",
+            )
+        self.learnt_normalized = bool(moments_of(self.env))
         if reset_num_timesteps:
             self.costs.latest.clear()
             self.costs.total[:] = 0.0
@@ -227,9 +233,18 @@ class Constrained(BaseAlgorithm):
         theirs = inspect.signature(super().learn)  # type: ignore[safe-super]
         if tb_log_name == theirs.parameters["tb_log_name"].default:
             tb_log_name = type(self).__name__
-        return super()._setup_learn(
+        begun = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
+        self.collecting = self.num_timesteps < begun[0]
+        return begun
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> Any:
+        self.collecting = True
+        try:
+            return super().collect_rollouts(*args, **kwargs)  # type: ignore[misc]
+        finally:
+            self.collecting = False
 
     def _update_info_buffer(
         self, infos: list[dict[str, Any]], dones: np.ndarray | None = None

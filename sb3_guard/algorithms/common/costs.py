@@ -3,14 +3,14 @@
 import re
 from collections import deque, namedtuple
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import Any, Literal
 
 import numpy as np
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_guard.checks import check_per_cost, is_number
+from sb3_guard.checks import check_per_cost
 from sb3_guard.costs import EpisodeCosts
+from sb3_guard.vector import step_limits
 
 # Agents that were saved while the estimate was one of these are read; their costs begin anew.
 CostEstimate = namedtuple("CostEstimate", "episode_cost horizon violation")
@@ -65,12 +65,8 @@ def scheduled_limits(algorithm: Any, remaining: float) -> np.ndarray:
 
 def time_limit(env: Any) -> float | None:
     """The mean over environments of the steps of an episode at most; None where not stated."""
-    for name in ("_max_episode_steps", "max_episode_steps"):  # of TimeLimit, and of our batches
-        with suppress(NotImplementedError):  # a vectorised environment need not tell
-            limits = env.get_attr(name) if env.has_attr(name) else []
-            if limits and all(is_number(limit) and limit > 0 for limit in limits):
-                return float(np.mean(limits))
-    return None
+    limits = step_limits(env)
+    return float(np.mean(limits)) if limits else None
 
 
 class Costs:

@@ -10,6 +10,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_guard.common.certificate import Certificate
 from sb3_guard.ids import with_version
 from sb3_guard.spelling import did_you_mean
+from sb3_guard.vector import normalizer_of
 from sb3_guard.zoo.cli.markdown import table
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.run.flags import RunFlags
@@ -76,7 +77,7 @@ def load_pretrained(
     model.num_timesteps = result["n_timesteps"]
     saved = th.load(weights(run), map_location=model.device, weights_only=True)
     model.set_parameters({"policy": saved["policy"]}, exact_match=False, device=model.device)
-    normalizer = model.get_vec_normalize_env()
+    normalizer = normalizer_of(model.get_env())
     if normalizer is not None:
         normalizer.training = False
         model.learnt_normalized = normalizer.norm_obs  # type: ignore[attr-defined]

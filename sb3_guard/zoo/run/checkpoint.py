@@ -9,7 +9,7 @@ import pickle
 import random
 import time
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from sb3_guard.common.evaluation import check_agent
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
-from sb3_guard.vector import BatchVecEnv
+from sb3_guard.vector import BatchVecEnv, layers, normalizer_of
 from sb3_guard.zoo.cli.usage import UsageError, explained
 from sb3_guard.zoo.run.logger import RunLogger
 from sb3_guard.zoo.run.make_envs import seed_rows
@@ -81,14 +81,6 @@ class ResumableEnv(gym.Wrapper):
                 layer.restore(part)
             else:
                 vars(layer).update(part)
-
-
-def layers(env: Any) -> Iterator[Any]:
-    """The wrappers of an environment from the outside in, and the environment itself last."""
-    while isinstance(env, gym.Wrapper | VecEnvWrapper):
-        yield env
-        env = env.env if isinstance(env, gym.Wrapper) else env.venv
-    yield env
 
 
 def _tells(layer: Any) -> bool:
@@ -264,7 +256,7 @@ class Checkpoints(BaseCallback):
             self.model.save(file)
             with zipfile.ZipFile(file, "a") as archive:
                 archive.writestr(MEMBER, pickle.dumps(state))
-                normalizer = self.model.get_vec_normalize_env()
+                normalizer = normalizer_of(self.training_env)
                 if normalizer is not None:
                     # Once more, so that the agent can be played without the environment's state.
                     archive.writestr(NORMALIZER, pickle.dumps(normalizer))

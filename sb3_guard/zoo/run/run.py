@@ -43,6 +43,7 @@ from sb3_guard.common.sources import Source
 from sb3_guard.common.vec_env import make_vec_env
 from sb3_guard.costs import read_costs
 from sb3_guard.fields import plain
+from sb3_guard.vector import moments_of, normalizer_of
 from sb3_guard.zoo.cli.flags import IDENTITY, START
 from sb3_guard.zoo.cli.names import FOLLOWED, classes, require_named
 from sb3_guard.zoo.cli.usage import (
@@ -371,16 +372,25 @@ class Run:
                     env = self._reshaped(env)
                 if normalizer is None and (beside := self._statistics_beside()) is not None:
                     normalizer = read_normalizer(beside)
-                if normalizer is not None:
-                    check_normalizer(normalizer, env.observation_space)
-                    normalizer.set_venv(env)
-                    env = normalizer
-                elif (scaled := normalization(values)) is not None:
-                    env = VecNormalize(env, **scaled)
+                env = self._normalized(env, normalizer)
                 if evaluation and isinstance(env, VecNormalize):
                     env.training = env.norm_reward = False
             made.pop_all()
         return env if replays else self._reshaped(env)
+
+    def _normalized(self, env: VecEnv, normalizer: VecNormalize | None) -> VecEnv:
+        """Normalised by given statistics, or by new ones if ``normalize`` asks for any."""
+        if normalizer_of(env) is not None:
+            raise ValueError("VecNormalize in vec_env_wrapper: use normalize instead")
+        scaled = normalization(self.hyperparams)
+        new = env if scaled is None else VecNormalize(env, **scaled)
+        if normalizer is None:
+            return new
+        check_normalizer(normalizer, env.observation_space)
+        if moments_of(new).keys() - moments_of(normalizer).keys():
+            raise ValueError("observation statistics lack some that normalize asks for")
+        normalizer.set_venv(env)
+        return normalizer
 
     def _reshaped(self, env: VecEnv) -> VecEnv:
         """Frames stacked, and images channels first, in evaluation as in training."""
@@ -698,7 +708,7 @@ class Run:
         """Save the agent; if training is finished, play it and write the result."""
         with replacing(folder.model) as file:
             self.model.save(file)
-        normalizer = self.model.get_vec_normalize_env()
+        normalizer = normalizer_of(self.env)
         if normalizer is not None:
             normalizer.save(str(folder.normalizer))
         final = self._play_final() if finished else {}

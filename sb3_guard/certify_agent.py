@@ -14,8 +14,9 @@ from sb3_guard.zoo.cli.flags import command
 
 def certify_agent(flags: Flags) -> int:
     """Play an agent's fresh episodes and print what they show; 0 if it is certified, else 1."""
-    from sb3_guard.common.certificate import MOST, certify
+    from sb3_guard.common.certificate import certify
     from sb3_guard.common.files import replacing
+    from sb3_guard.judging import EPISODES
     from sb3_guard.zoo.agents.playback import BATCH, open_agent
     from sb3_guard.zoo.cli.usage import explained
     from sb3_guard.zoo.run.make_envs import BAD_NUMBERS
@@ -29,7 +30,7 @@ def certify_agent(flags: Flags) -> int:
             agent.model,
             agent.env,
             limits[0] if len(limits) == 1 else limits or None,
-            n_episodes=flags.n_episodes or MOST,
+            n_episodes=flags.n_episodes or EPISODES,
             deterministic=not agent.stochastic,
             seed=flags.seed,
         )

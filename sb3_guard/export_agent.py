@@ -11,8 +11,11 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.deployment import onnx_file
+from sb3_guard.judging import Mean
 from sb3_guard.zoo.agents.flags import ExportFlags as Flags
 from sb3_guard.zoo.agents.playback import BATCH, EPISODES, open_agent
 from sb3_guard.zoo.cli.flags import command
@@ -33,12 +36,17 @@ def export_agent(flags: Flags) -> int:
         with explained(f"can't play {agent.path}", *BAD_NUMBERS):
             evaluation = evaluate_policy(agent.model, agent.env, episodes, **how)
         settings, certificate = agent.run.hyperparams(), agent.certificate
-        by_key = evaluation.by_key().values()
-        costs = [cost.judged(limit) for cost, limit in by_key]
+        limits = evaluation.limits
+        costs = {
+            key: {**Mean.of(cost).data(), "limit": limit if np.isfinite(limit) else None}
+            for key, cost, limit in zip(
+                limits.keys, evaluation.limited.T, limits.values.tolist(), strict=True
+            )
+        }
         measured = {
             "episodes": len(evaluation),
-            "return": evaluation.estimate(evaluation.returns).judged(None),
-            "costs": dict(zip(evaluation.cost_keys, costs, strict=True)),
+            "return": Mean.of(evaluation.returns).data(),
+            "costs": costs,
         }
         trained = {
             "algo": flags.algo,

@@ -1,9 +1,9 @@
 """Ship the best certified agents of the grand table: ``python scripts/pretrain.py logs/grand``.
 
 The runs below the folder are those that ``scripts/leaderboard.py --train`` writes. A run is
-certified if the 95 % intervals of the mean cost of its final episodes, with sampled actions and
-with the most likely ones, end at or below the limit; of an environment's certified runs that with
-the highest return is taken. With less than a tenth of the best run's return, of whatever cost, it
+a candidate if the mean cost of its final episodes plus two standard errors is within the limit, with
+sampled actions and with the most likely ones; of an environment's candidates that with the highest
+return is taken. With less than a tenth of the best run's return, of whatever cost, it
 hardly does its task and does not count. It is certified with each kind of actions, by fresh
 episodes, and shipped if it is; else the next one is tried. An agent that is
 shipped already is kept if its return is as high. Runs from a packed archive have no model:
@@ -27,8 +27,8 @@ from archives import with_log_folder
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_guard import Certificate, certify
-from sb3_guard.common.delivery import TRIES
-from sb3_guard.costs import estimate
+from sb3_guard.common.certificate import TRAINING_ONLY
+from sb3_guard.judging import TRIES, Limits
 from sb3_guard.zoo.agents.pretrained import (
     PLAYED,
     PRETRAINED,
@@ -61,11 +61,6 @@ LIMITS = {
     "Goal_Swimmer_8Hazards-v0": 2.0,
 }
 SEEDS = {"stochastic": 10_000, "deterministic": 20_000}
-# Parameters of a policy that it acts without: critics and targets.
-TRAINING_ONLY = (
-    "value_net.", "mlp_extractor.value_net.", "vf_features_extractor.", "critic.",
-    "critic_target.", "actor_target.",
-)  # fmt: skip
 DROPPED = ("final", "platform", "seconds")  # of result.json
 
 
@@ -84,9 +79,11 @@ def candidates(folder: Path, env_id: str, least: float) -> Iterator[RunFolder]:
         if not final or result.get("cost_limit") not in (None, LIMITS[env_id]):
             continue
         means = [float(np.mean(episodes["returns"])) for episodes in final.values()]
-        ends = [estimate(np.array(episodes["costs"])).high for episodes in final.values()]
+        limits = Limits(np.array([LIMITS[env_id]]))
+        costs = [np.array(episodes["costs"])[:, None] for episodes in final.values()]
+        safe = max(float(limits.excess(cost, 2.0)[0]) for cost in costs) <= 0.0
         best = max(best, means[0])
-        if means[0] > least and max(ends) <= LIMITS[env_id]:
+        if means[0] > least and safe:
             certified.append((means[0], min(means), str(path)))
     for mean, lower, name in sorted(certified, reverse=True):
         if lower < best / 10 and best > 0:
@@ -126,6 +123,21 @@ def played(run: RunFolder) -> dict[str, Certificate]:
     return values
 
 
+def certify_again() -> None:
+    """Play the shipped agents anew, for certificates of this version."""
+    for run in pretrained():
+        algo, result = run.path.parent.name, run.checked_result()
+        for actions, seed in SEEDS.items():
+            limits = [c["limit"] for c in result["played"][actions]["costs"].values()]
+            model = load_pretrained(run.name, algo, seed=seed, n_envs=100, device="cpu")
+            greedy = actions == "deterministic"
+            got = certify(model, model.env, limits, deterministic=greedy, seed=seed, tries=TRIES)
+            model.env.close()
+            print(run.path, got, flush=True)
+            result["played"][actions] = json.loads(got.to_json())
+        run.write_result(result)
+
+
 def actions_of(model: BaseAlgorithm, raw: np.ndarray, actions: str) -> np.ndarray:
     """What an agent does where it observes this, before normalisation."""
     normalizer = model.get_vec_normalize_env()
@@ -150,7 +162,7 @@ def write(run: RunFolder, limit: float | None, got: dict[str, Certificate]) -> R
     copy = RunFolder(path)
     policy = original.policy.state_dict()
     saved: dict[str, Any] = {"policy": {n: t.clone() for n, t in policy.items()
-                                        if not n.startswith(TRAINING_ONLY)}}  # fmt: skip
+                                        if not n.startswith(tuple(f"{part}." for part in TRAINING_ONLY))}}  # fmt: skip
     if (normalizer := original.get_vec_normalize_env()) is not None:
         for name in ("mean", "var"):
             saved[name] = th.as_tensor(getattr(normalizer.obs_rms, name), dtype=th.float64)
@@ -190,8 +202,12 @@ def record(original: BaseAlgorithm, copy: BaseAlgorithm, name: str) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("folder", type=Path, help="folder of the grand table's runs")
+    parser.add_argument("folder", type=Path, nargs="?", help="folder of the grand table's runs")
+    parser.add_argument("--again", action="store_true", help="certify the shipped agents anew")
     args = parser.parse_args()
+    if args.again:
+        certify_again()
+        return
     for env_id, limit in LIMITS.items():
         shipped = shipped_return(env_id)
         for run in candidates(args.folder, env_id, shipped):

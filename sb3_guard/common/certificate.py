@@ -30,6 +30,11 @@ from sb3_guard.vector import (
 PACKAGES = "sb3-guard", "stable-baselines3", "torch", "mujoco"
 # Arguments of an environment that change its pictures alone
 DRAWN = {"render_mode", "width", "height", "camera_name", "camera_id"}
+#: Parts of a policy that it acts without: critics and targets.
+TRAINING_ONLY = (
+    "value_net", "mlp_extractor.value_net", "vf_features_extractor", "critic", "critic_target",
+    "actor_target",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -169,16 +174,24 @@ def agent_hash(model: Any, env: VecEnv) -> str:
     """
     SHA-256 of all that makes a policy act as it does; "" of objects without weights.
 
-    It covers networks, their activations and weights, and of the normaliser of observations means,
-    variances, clipping and epsilon.
+    It covers the networks that act, their activations and weights, and of the normaliser of
+    observations means, variances, clipping and epsilon.
     """
     digest = hashlib.sha256()
     policy = getattr(model, "policy", model)
-    if not isinstance(policy, th.nn.Module) or not (weights := policy.state_dict()):
+    if not isinstance(policy, th.nn.Module) or not policy.state_dict():
         return ""
-    digest.update(f"{type(policy).__name__} {policy}".encode())
-    for name, tensor in sorted(weights.items()):
-        digest.update(name.encode() + np.ascontiguousarray(tensor.cpu()).tobytes())
+
+    def acts(name: str) -> bool:
+        return not any(f"{name}.".startswith(f"{part}.") for part in TRAINING_ONLY)
+
+    digest.update(type(policy).__name__.encode())
+    for name, module in policy.named_modules():
+        if acts(name) and not [*module.children()]:
+            digest.update(f"{name} {module}".encode())
+    for name, tensor in sorted(policy.state_dict().items()):
+        if acts(name):
+            digest.update(name.encode() + np.ascontiguousarray(tensor.cpu()).tobytes())
     moments, normalizer = moments_of(env), normalizer_of(env)
     if moments and normalizer:
         digest.update(f"{normalizer.clip_obs:g} {normalizer.epsilon:g}".encode())

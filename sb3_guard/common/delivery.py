@@ -33,6 +33,18 @@ FINAL_EPISODES = 100  # of the last policy, with each kind of actions
 EVALUATIONS = 10  # of a training, where no frequency is given
 
 
+def play_final(
+    model: Any, env: VecEnv, episodes: int, seed: int, verbose: bool
+) -> dict[bool, Evaluation]:
+    """Episodes of the last policy, by whether they are of its most likely actions."""
+    played = {}
+    for deterministic, actions in ((False, "sampled"), (True, "most likely")):
+        played[deterministic] = evaluate_policy(model, env, episodes, deterministic, seed=seed)
+        if verbose and len(played[deterministic]):
+            print(f"Final policy, {actions} actions, {played[deterministic]}")
+    return played
+
+
 class Candidate(NamedTuple):
     """A policy that an evaluation has played, with one kind of actions.
 
@@ -77,7 +89,7 @@ class DeliveryCallback(CostEvalCallback):
     :param certificate_env: another environment like ``eval_env`` for the last policy's episodes and
         the certificate's; None: ``eval_env``
     :param n_episodes: episodes of a certificate, at least 100
-    :param final_episodes: of the last policy, with each kind of actions
+    :param final_seed: of the last policy's episodes; None: drawn from ``seed``
     :param deterministic: certify the most likely actions, or sampled ones; None: either, if the
         agent can be exported with sampled ones
     :param eval_freq: evaluate every this many calls; None: ten times in the training
@@ -92,16 +104,17 @@ class DeliveryCallback(CostEvalCallback):
         *,
         certificate_env: VecEnv | None = None,
         n_episodes: int = EPISODES,
-        final_episodes: int = FINAL_EPISODES,
+        final_seed: int | None = None,
         eval_freq: int | None = None,
         **kwargs: Any,
     ) -> None:
         super().__init__(eval_env, eval_freq=eval_freq or 0, **kwargs)
         fit("n_episodes", n_episodes, int, LEAST, ends="[)")
-        fit("final_episodes", final_episodes, int, 2, ends="[)")
         self.certificate_env = self.eval_env if certificate_env is None else certificate_env
         self.folder, self.cost_limit = Path(folder), cost_limit
-        self.n_episodes, self.final_episodes = n_episodes, final_episodes
+        self.n_episodes = n_episodes
+        child = np.random.SeedSequence(self.seed, spawn_key=(3,)).generate_state(1)[0] >> 1
+        self.final_seed = int(child) if final_seed is None else final_seed
         self.evenly = eval_freq is None
         #: of the agent that was delivered; None: none was
         self.certificate: Certificate | None = None
@@ -201,12 +214,9 @@ class DeliveryCallback(CostEvalCallback):
             return
         began = time.process_time()
         sync_normalization(self.training_env, self.certificate_env)
-        for kind in self.kinds():
-            self.final[kind] = self._play_final(kind)
-            if self.verbose > 0 and len(self.final[kind]):
-                actions = "most likely" if kind else "sampled"
-                print(f"Final policy, {actions} actions, {self.final[kind]}")
-        last = self._content(self.final)
+        env, verbose = self.certificate_env, self.verbose > 0
+        self.final = play_final(self.model, env, FINAL_EPISODES, self.final_seed, verbose)
+        last = self._content({kind: self.final[kind] for kind in self.kinds()})
         last["policy"] = {name: part.clone() for name, part in last["policy"].items()}
         try:
             told = self._deliver(last)
@@ -220,16 +230,6 @@ class DeliveryCallback(CostEvalCallback):
         if self.verbose > 0:
             print(f"{told} ({time.process_time() - began:.0f} s of a processor)")
 
-    def _play_final(self, deterministic: bool) -> Evaluation:
-        return evaluate_policy(
-            self.model,
-            self.certificate_env,
-            self.final_episodes,
-            deterministic,
-            seed=self.seed + 1,
-            cost_keys=self.cost_keys,
-        )
-
     def _deliver(self, last: dict[str, Any]) -> str:
         """Certify the best candidate; what to say of it."""
         limits, refused = self._certified_limits(), list[Certificate]()
@@ -242,7 +242,7 @@ class DeliveryCallback(CostEvalCallback):
                 n_episodes=self.n_episodes,
                 deterministic=candidate.deterministic,
                 cost_keys=limits.keys,
-                seed=self.seed + 2 + len(refused),
+                seed=self.seed + len(refused),
                 tries=TRIES,
             )
             if certificate.verdict == "certified":

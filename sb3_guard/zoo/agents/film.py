@@ -15,10 +15,9 @@ from PIL import Image, ImageDraw, ImageFont
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
-from sb3_guard.costs import bounded_name
+from sb3_guard.judging import Limits
 from sb3_guard.zoo.cli.usage import UsageError, explained
 
 
@@ -29,15 +28,12 @@ def caption(env: VecEnv, model: BaseAlgorithm | None) -> str:
     :param env: one environment, in a ``CostMonitor``
     :param model: whose limits are said
     """
-    monitor, limit_on = find_monitor(env), getattr(model, "limit_on", "sum")
-    keys, episodes = monitor.cost_keys, monitor.episodes
-    limited = isinstance(model, Constrained) and model.constrained
-    limits: Any = model.final_cost_limits.tolist() if limited else [None] * len(keys)  # type: ignore[union-attr]
-    costs = episodes.highest if limit_on == "max" else episodes.totals
+    monitor = find_monitor(env)
+    limits, episodes = Limits.of(model, monitor.cost_keys), monitor.episodes
+    costs = (episodes.highest if limits.on == "max" else episodes.totals)[0, -len(limits.keys) :]
     words = [f"return {monitor.episode_returns[0]:z.2f}"]
-    for key, cost, limit in zip(keys, costs[0, -len(keys) :], limits, strict=True):
-        name = bounded_name(key, limit_on)
-        words.append(f"{name} {cost:.2f}" + ("" if limit is None else f" (limit {limit:g})"))
+    for name, cost, limit in zip(limits.names, costs, limits.values, strict=True):
+        words.append(f"{name} {cost:.2f}" + f" (limit {limit:g})" * bool(np.isfinite(limit)))
     return "    ".join(words)
 
 

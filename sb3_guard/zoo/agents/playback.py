@@ -11,7 +11,8 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
-from sb3_guard.common.certificate import Certificate, agent_hash
+from sb3_guard.common.certificate import Certificate
+from sb3_guard.common.delivery import MODEL
 from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.ids import with_version
 from sb3_guard.zoo.agents.dataset import recording
@@ -85,7 +86,7 @@ def find_model(run: RunFolder, flags: AgentFlags) -> tuple[Path, Path]:
     elif (run.path / "certificate.json").is_file() and not (
         flags.load_final or flags.load_last_checkpoint
     ):
-        model = run.path / "certified_model.zip"
+        model = run.path / MODEL
         statistics = run.path / "certified_model_vecnormalize.pkl"
     elif run.model.is_file() and not flags.load_last_checkpoint:
         model, statistics = run.model, run.normalizer
@@ -119,16 +120,31 @@ class Agent:
 
     @property
     def certificate(self) -> Certificate | None:
-        """What was certified of this very agent, and of such actions."""
+        """The certificate of this very agent, in this environment, with such actions."""
+        there = self._filed()
+        return None if there is None or self._foreign(there) else there
+
+    @property
+    def certified(self) -> str:
+        """The certificate, or of what else the one beside the agent is; empty: there is none."""
+        there = self._filed()
+        if there is None:
+            return ""
+        foreign = self._foreign(there)
+        return f"Its certificate is of {foreign}" if foreign else str(there)
+
+    def _filed(self) -> Certificate | None:
+        """The certificate that lies beside the agent, whatever it is of."""
         if PRETRAINED in self.path.parents:
             return certificates(self.run)["stochastic" if self.stochastic else "deterministic"]
         file = self.path.with_name("certificate.json")
-        if self.path.name != "certified_model.zip" or not file.is_file():
+        if self.path.name != MODEL or not file.is_file():
             return None
         with explained(f"{file} is damaged"):
-            certificate = Certificate.from_json(file.read_text())
-        same = certificate.agent == agent_hash(self.model, self.env)
-        return certificate if same and certificate.deterministic != self.stochastic else None
+            return Certificate.from_json(file.read_text())
+
+    def _foreign(self, certificate: Certificate) -> str:
+        return certificate.foreign(self.model, self.env, not self.stochastic)
 
 
 def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> Agent:
@@ -211,8 +227,8 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
         trained_at = "" if limit is None else f", trained at limit {limit:g}"
         sampled = ", sampled actions" if agent.stochastic else ""
         print(f"Playing {agent.path} on {agent.env_id}{trained_at}{sampled}")
-        if agent.certificate is not None:
-            print(agent.certificate)
+        if agent.certified:
+            print(agent.certified)
     shown: AbstractContextManager[Any] = nullcontext(None)
     if video is not None:
         shown = filming(agent.env, agent.model, video)

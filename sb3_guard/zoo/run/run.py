@@ -32,17 +32,17 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
 from sb3_guard.algorithms.common.constrained import Constrained
-from sb3_guard.algorithms.common.costs import time_limit
-from sb3_guard.common.callbacks import CostEvalCallback, LogCosts, selection_limits
-from sb3_guard.common.certificate import MOST
-from sb3_guard.common.delivery import DeliveryCallback
-from sb3_guard.common.evaluation import check_normalizer, evaluate_policy, sync_normalization
+from sb3_guard.algorithms.common.costs import limits_at, time_limit
+from sb3_guard.common.callbacks import CostEvalCallback, LogCosts
+from sb3_guard.common.delivery import FINAL_EPISODES, DeliveryCallback, play_final
+from sb3_guard.common.evaluation import Evaluation, check_normalizer, sync_normalization
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
 from sb3_guard.common.sources import Source
 from sb3_guard.common.vec_env import make_vec_env
 from sb3_guard.costs import read_costs
 from sb3_guard.fields import plain
+from sb3_guard.judging import EPISODES, Limits
 from sb3_guard.vector import moments_of, normalizer_of
 from sb3_guard.zoo.cli.flags import IDENTITY, START
 from sb3_guard.zoo.cli.names import FOLLOWED, classes, require_named
@@ -85,8 +85,7 @@ from sb3_guard.zoo.run.make_envs import (
 )
 from sb3_guard.zoo.run.progress import Epochs, summary
 
-FINAL_EPISODES = 100  # of each policy, after training
-DELIVERY_ENVS = 50  # in which candidates are screened and certified
+CERTIFICATE_ENVS = 100  # in which the last policy is played, and certificates are
 WANDB = "wandb.txt"  # beside the run's configuration: its id at Weights & Biases
 
 
@@ -117,7 +116,6 @@ class Run:
         self.env: VecEnv
         self.callbacks: list[BaseCallback]
         self.evaluation: CostEvalCallback | None = None
-        self.delivery: DeliveryCallback | None = None
         #: what to continue from
         self.begun: dict[str, Any] | None = None
 
@@ -203,16 +201,17 @@ class Run:
         flags.vec_env = run.source.stepped(flags.vec_env, lone)
         return run
 
-    def limits(self) -> np.ndarray:
+    def limits(self) -> Limits:
         """
-        Episode cost up to which a model of this run counts as safe, one per cost key.
+        Episode costs up to which a model of this run counts as safe.
 
         :raises UsageError: ``selection_limit`` does not fit the cost keys
         """
-        values = self.hyperparams
-        cost_limit = values.get("cost_limit") if self.constrained else None
+        values, m = self.hyperparams, len(self.cost_keys)
+        limit = limits_at(values.get("cost_limit"), 0.0) if self.constrained else np.inf
+        limits = Limits(np.broadcast_to(np.asarray(limit, float), m), self.cost_keys)
         with explained("hyperparameter", ValueError):
-            return selection_limits(values.get("selection_limit"), cost_limit, self.cost_keys)
+            return limits.to_choose(values.get("selection_limit"))
 
     def try_out(self) -> None:
         """
@@ -250,39 +249,56 @@ class Run:
         self.env = self.model.get_env()  # type: ignore[assignment]
         try:
             self.model.verbose = max(flags.verbose - 1, 0)
-            if flags.eval_freq > 0:
-                self.limits()
-                self.evaluation = CostEvalCallback(
-                    self.make_evaluation_envs(flags.eval_episodes),
-                    selection_limit=self.hyperparams.get("selection_limit"),
-                    seed=evaluation_seed(flags.seed),
-                    n_eval_episodes=flags.eval_episodes,
-                    eval_freq=max(flags.eval_freq // self.hyperparams["n_envs"], 1),
-                    verbose=int(flags.verbose > 0),
-                )
+            self.limits()
+            self.evaluation = self._make_evaluation()
+            if self.evaluation is not None:
                 self.evaluation.model = self.model
-            if self.constrained and (episodes := self._certificate_episodes()):
-                env = self.make_evaluation_envs(DELIVERY_ENVS)
-                seed, verbose = evaluation_seed(flags.seed, 2), int(flags.verbose > 0)
-                with explained("--certify", ValueError):
-                    self.delivery = DeliveryCallback(
-                        env, n_episodes=episodes, seed=seed, verbose=verbose
-                    )
         except BaseException:
             self.close()
             raise
         return self
 
+    def _make_evaluation(self) -> CostEvalCallback | None:
+        """The callback that evaluates, and delivers where the training ends with a certificate."""
+        flags, episodes = self.flags, self._certificate_episodes()
+        if flags.eval_freq <= 0 and not episodes:
+            return None
+        how: dict[str, Any] = {
+            "selection_limit": self.hyperparams.get("selection_limit"),
+            "seed": evaluation_seed(flags.seed),
+            "n_eval_episodes": flags.eval_episodes,
+            "eval_freq": max(flags.eval_freq // self.hyperparams["n_envs"], flags.eval_freq > 0),
+            "verbose": int(flags.verbose > 0),
+        }
+        env = self.make_evaluation_envs(flags.eval_episodes)
+        if not episodes:
+            return CostEvalCallback(env, **how)
+        with explained("--certify", ValueError):
+            return DeliveryCallback(
+                env,
+                certificate_env=self.make_evaluation_envs(CERTIFICATE_ENVS),
+                n_episodes=episodes,
+                final_seed=evaluation_seed(flags.seed, 1),
+                **how,
+            )
+
+    @property
+    def delivery(self) -> DeliveryCallback | None:
+        """The callback that ends the training with a certificate, if there is one."""
+        return self.evaluation if isinstance(self.evaluation, DeliveryCallback) else None
+
     def _certificate_episodes(self) -> int:
-        """Most episodes of the certificate that the training ends with; 0: it ends without one."""
-        if self.flags.certify is not None:
-            return self.flags.certify
+        """Episodes of the certificate that the training ends with; 0: it ends without one."""
+        if not self.constrained or self.flags.certify is not None:
+            return self.constrained * (self.flags.certify or 0)
         episode = time_limit(self.env)  # None: unknown
-        return MOST if episode and self.hyperparams["n_timesteps"] >= 1000 * episode else 0
+        return EPISODES if episode and self.hyperparams["n_timesteps"] >= 1000 * episode else 0
 
     def close(self) -> None:
         """Release the environments."""
-        others = [callback.eval_env for callback in (self.evaluation, self.delivery) if callback]
+        evaluation, delivery = self.evaluation, self.delivery
+        others = [evaluation.eval_env] if evaluation else []
+        others += [delivery.certificate_env] if delivery else []
         for env in (self.env, *others):
             with suppress(*PROCESS_DIED):
                 env.close()
@@ -661,7 +677,6 @@ class Run:
             others.append(self.evaluation)
         if self.delivery is not None:
             self.delivery.folder = folder.path
-            others.append(self.delivery)
         return Checkpoints(
             folder.checkpoint,
             [*others, *self.callbacks],
@@ -711,7 +726,9 @@ class Run:
         normalizer = normalizer_of(self.env)
         if normalizer is not None:
             normalizer.save(str(folder.normalizer))
-        final = self._play_final() if finished else {}
+        played = (self.delivery and self.delivery.final) or self._play_final() if finished else {}
+        final = {name: _data(played[name == "greedy"]) for name in PLAYED if played}
+        final = {name: data for name, data in final.items() if data["returns"]}  # that have ended
         result = {"algo": self.flags.algo, "env": self.flags.env, **result, "final": final}
         if self.delivery is not None:
             certificate = self.delivery.certificate
@@ -721,47 +738,42 @@ class Run:
             folder.write_result(result | made)
         return result
 
-    def _play_final(self) -> dict[str, dict[str, Any]]:
+    def _play_final(self) -> dict[bool, Evaluation]:
         """
-        Play 100 episodes of the final policy twice: with sampled actions, and with its mean.
+        Play the final policy.
 
-        :return: ``returns``, ``costs`` and ``lengths``, a number an episode, of ``stochastic`` and
-            ``greedy`` actions, and ``bounded``, what the limits bound by cost key, where that is
-            something else than the cost. Empty after a training of less than eight episodes: an
-            eighth of its episodes is the most that each policy plays
+        :return: of each kind of actions 100 episodes, or an eighth of the training's if these are
+            fewer; empty if that is none
         """
         episodes = min(FINAL_EPISODES, find_monitor(self.env).episode_count // 8)
         if not episodes:
             return {}
-        env = self.make_evaluation_envs(episodes)
-        final: dict[str, dict[str, Any]] = {}
-
-        def rounded(values: np.ndarray) -> list[float | None]:
-            return [None if np.isnan(value) else float(f"{value:.6g}") for value in values]
-
-        with closing(env):
+        with closing(self.make_evaluation_envs(episodes)) as env:
             sync_normalization(self.env, env)
-            for name in PLAYED:
-                played = evaluate_policy(
-                    self.model,
-                    env,
-                    episodes,
-                    deterministic=name == "greedy",
-                    seed=evaluation_seed(self.flags.seed, 1),
-                )
-                if not len(played):  # no episode of the greedy policy ends
-                    continue
-                if self.flags.verbose > 0:
-                    print(f"Final policy, {PLAYED[name]}, {played}")
-                final[name] = {
-                    "returns": rounded(played.returns),
-                    "costs": rounded(played.costs),
-                    "lengths": played.lengths.tolist(),
-                }
-                if len(played.cost_keys) > 1 or played.limit_on == "max":
-                    bounded = zip(played.cost_keys, played.limited.T, strict=True)
-                    final[name]["bounded"] = {key: rounded(costs) for key, costs in bounded}
-        return final
+            seed = evaluation_seed(self.flags.seed, 1)
+            return play_final(self.model, env, episodes, seed, self.flags.verbose > 0)
+
+
+def _data(played: Evaluation) -> dict[str, Any]:
+    """
+    Episodes as data, a number an episode.
+
+    :return: ``returns``, ``costs`` and ``lengths``, and ``bounded``, what the limits bound by cost
+        key, where that is something else than the cost
+    """
+
+    def rounded(values: np.ndarray) -> list[float | None]:
+        return [None if np.isnan(value) else float(f"{value:.6g}") for value in values]
+
+    data: dict[str, Any] = {
+        "returns": rounded(played.returns),
+        "costs": rounded(played.costs),
+        "lengths": played.lengths.tolist(),
+    }
+    if len(played.cost_keys) > 1 or played.limits.on == "max":
+        bounded = zip(played.cost_keys, played.limited.T, strict=True)
+        data["bounded"] = {key: rounded(costs) for key, costs in bounded}
+    return data
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:

@@ -58,7 +58,7 @@ def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
     for corner in search.corners():
         check(flags.algo, run.algorithm, corner)
     run.make().close()
-    limits = run.limits().tolist()
+    limits = run.limits()
     settings = Settings(
         algo=run.flags.algo,
         env=run.flags.env,
@@ -69,7 +69,7 @@ def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
         n_evaluations=flags.n_evaluations or max(n_timesteps // 100_000, 4),
         eval_episodes=flags.eval_episodes,
         cost_keys=list(run.cost_keys),
-        cost_limit=limits if np.isfinite(limits).all() else None,
+        cost_limit=limits.values.tolist() if limits else None,
     )
     return run.flags, settings, search
 

@@ -19,6 +19,7 @@ from optuna.storages import RetryHeartbeatStaleTrialCallback
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
+from sb3_guard.judging import Limits
 from sb3_guard.zoo.cli.usage import UsageError, one_line
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.flags import RunFlags
@@ -66,8 +67,11 @@ class Settings:
 
     def excess(self, costs: Sequence[float]) -> dict[str, float]:
         """By how much each cost is above its limit, below 0 if under it; empty without limits."""
-        limits = self.cost_limit or ()
-        return {key: c - d for key, c, d in zip(self.cost_keys, costs, limits, strict=False)}
+        if self.cost_limit is None:
+            return {}
+        limits = Limits(np.array(self.cost_limit), tuple(self.cost_keys))
+        excess = limits.excess(np.array([costs]), caution=0.0)
+        return dict(zip(self.cost_keys, excess.tolist(), strict=True))
 
     def outcome(self, mean: Sequence[float]) -> dict[str, float]:
         """Return, costs by key, and by how much they exceed their limits in all."""

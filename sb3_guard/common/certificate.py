@@ -3,7 +3,7 @@
 import hashlib
 import json
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from importlib.metadata import version
 from typing import Any
@@ -18,7 +18,7 @@ from sb3_guard.checks import check_cost_keys
 from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.common.monitor import cost_keys_of
 from sb3_guard.fields import fit
-from sb3_guard.judging import EPISODES, ERROR, LEAST, Bound, Judgement, Limits, Verdict, decide
+from sb3_guard.judging import EPISODES, ERROR, LEAST, Bound, Judgement, Limits, decide
 from sb3_guard.vector import (
     as_vec_env,
     lacks_statistics,
@@ -144,30 +144,21 @@ class Certificate(Judgement):
 
         :raises ValueError: the text is no certificate, or contradicts itself
         """
-        content = _object(json.loads(text), cls)
-        costs = content["costs"]
-        if not isinstance(costs, Mapping) or not costs:
-            raise ValueError("a certificate has costs by name")
-        bounds = {str(name): Bound(**_object(cost, Bound)) for name, cost in costs.items()}
-        certificate = cls(**{**content, "costs": bounds})
-        safe = all(cost.verdict == "certified" for cost in bounds.values())
-        if certificate.verdict == "certified" and (not safe or certificate.physics_errors):
-            raise ValueError("a certificate's verdict contradicts its bounds")
+
+        def read(kind: type, content: Any) -> Any:
+            types = {entry.name: entry.type for entry in fields(kind)}
+            return kind(**{name: fit(name, content[name], types[name]) for name in types})
+
+        try:
+            content = json.loads(text)
+            costs = {name: read(Bound, cost) for name, cost in content["costs"].items()}
+            certificate: Certificate = read(cls, {**content, "costs": costs})
+        except (TypeError, KeyError, AttributeError) as error:
+            raise ValueError(f"not of a certificate: {error!r}") from None
+        safe = [cost.verdict == "certified" for cost in costs.values()]
+        if not safe or (certificate.verdict == "certified" and not all(safe)):
+            raise ValueError("its verdict contradicts its bounds")
         return certificate
-
-
-def _object(content: Any, cls: Any) -> dict[str, Any]:
-    """
-    The fields of a dataclass as JSON has them.
-
-    :raises ValueError: a field is absent, unknown, or of another type
-    """
-    types = {entry.name: entry.type for entry in fields(cls)}
-    if not isinstance(content, Mapping) or content.keys() != types.keys():
-        raise ValueError(f"must be an object with the entries {', '.join(types)}")
-    simple = {float, int, bool, str, int | None, float | None, Verdict}
-    given = {name: kind for name, kind in types.items() if kind in simple}
-    return {**content, **{name: fit(name, content[name], kind) for name, kind in given.items()}}
 
 
 def agent_hash(model: Any, env: VecEnv) -> str:

@@ -2,8 +2,11 @@
 
 import math
 import os
+import pickle
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,6 +29,7 @@ HELP = (
     "a training with more steps (-n), more episodes (--certify), a lower cost_limit than you need, "
     "or SAC-Lagrangian may help"
 )
+CERTIFICATE = "certificate.json"
 MODEL, NORMALIZER = "certified_model.zip", "certified_model_vecnormalize.pkl"
 CANDIDATES = 8  # files, at most
 FORMAT = "sb3_guard candidate"
@@ -126,10 +130,14 @@ class DeliveryCallback(CostEvalCallback):
         :raises ValueError: the limit is not finite, or does not fit the costs, or ``eval_env`` is
             not normalised as the training is, has other actions, or a wrapper that is for training
             only
-        :raises OSError: the folder can't be written
+        :raises OSError: the folder can't be written, or ``certificate.json`` is of something else
         """
         self._certified_limits()
         super()._init_callback()
+        if (file := self.folder / CERTIFICATE).exists() and not (self.folder / MODEL).exists():
+            raise FileExistsError(
+                f"{file} is not of this callback, which would replace it; choose another folder"
+            )
         for env in (self.eval_env, self.certificate_env):
             refuse_training_only(env)
             sync_normalization(self.training_env, env)
@@ -225,8 +233,7 @@ class DeliveryCallback(CostEvalCallback):
         finally:
             self._put(last)
         if self.certificate is None:
-            for name in ("certificate.json", MODEL, NORMALIZER):  # of an earlier training
-                (self.folder / name).unlink(missing_ok=True)
+            self._withdraw()
         if self.verbose > 0:
             print(f"{told} ({time.process_time() - began:.0f} s of a processor)")
 
@@ -276,18 +283,28 @@ class DeliveryCallback(CostEvalCallback):
             part.mean, part.var, part.count = mean.numpy(), var.numpy(), count
         return int(content["num_timesteps"])
 
+    def _withdraw(self) -> None:
+        """Remove the agent of an earlier training."""
+        for name in (CERTIFICATE, NORMALIZER, MODEL):  # without the first they are not taken
+            (self.folder / name).unlink(missing_ok=True)
+
     def _write(self, certificate: Certificate, steps: int) -> None:
         """Put the certified agent into the place of an earlier one."""
+        contents = {CERTIFICATE: certificate.to_json().encode()}
+        if (normalizer := normalizer_of(self.certificate_env)) is not None:
+            contents[NORMALIZER] = pickle.dumps(normalizer)
         trained, self.model.num_timesteps = self.model.num_timesteps, steps
-        with replacing(self.folder / MODEL) as file:
-            self.model.save(file)
+        self.model.save(model := BytesIO())
         self.model.num_timesteps = trained
-        normalizer = normalizer_of(self.certificate_env)
-        if normalizer is not None:
-            normalizer.save(str(self.folder / NORMALIZER))
-        # Last: until then the earlier certificate is of another agent than the one that is there.
-        with replacing(self.folder / "certificate.json") as file:
-            file.write(certificate.to_json().encode())
+        contents[MODEL] = model.getvalue()
+        with ExitStack() as files:
+            # Until all are written the earlier agent stays. Then the files take their names, in
+            # reverse: the certificate, which vouches for the others, is the last one.
+            for name, content in contents.items():
+                file = files.enter_context(replacing(self.folder / name))
+                file.write(content)
+                file.flush()
+            self._withdraw()
         self.certificate = certificate
 
 

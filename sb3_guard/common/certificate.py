@@ -5,7 +5,7 @@ import json
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from importlib.metadata import version
 from typing import Any, Literal
 
@@ -211,11 +211,25 @@ class Certificate:
 
     @classmethod
     def from_json(cls, text: str) -> "Certificate":
-        """The certificate that :meth:`to_json` wrote."""
-        content = json.loads(text)
-        costs = {name: CostBound(**cost) for name, cost in content["costs"].items()}
-        del content["verdict"]
-        return cls(**{**content, "costs": costs})
+        """
+        The certificate that :meth:`to_json` wrote.
+
+        :raises ValueError: the text is another, or damaged
+        """
+
+        def read(kind: type, content: Any) -> Any:
+            names = {entry.name: entry.type for entry in fields(kind)}
+            return kind(**{name: fit(name, content[name], names[name]) for name in names})
+
+        try:
+            content = json.loads(text)
+            costs = {name: read(CostBound, cost) for name, cost in content["costs"].items()}
+            if not costs:
+                raise ValueError("there is no cost")
+            certificate: Certificate = read(cls, {**content, "costs": costs})
+            return certificate
+        except (TypeError, KeyError, AttributeError) as error:
+            raise ValueError(f"not of a certificate: {error!r}") from None
 
 
 def agent_hash(model: Any, env: VecEnv) -> str:

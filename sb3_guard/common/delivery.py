@@ -1,9 +1,13 @@
 """A training that ends with a certified agent: candidates, screening, certificate."""
 
+import copy
 import math
 import os
+import pickle
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +36,9 @@ HELP = (
     "a training with more steps (-n), more episodes (--certify), a lower cost_limit than you need, "
     "or SAC-Lagrangian may help"
 )
+CERTIFICATE = "certificate.json"
 MODEL, NORMALIZER = "certified_model.zip", "certified_model_vecnormalize.pkl"
+CANDIDATE = {"num_timesteps", "policy", "statistics"}  # the entries of its file
 TRIES = 3  # of candidates, with one kind of actions or the other; they share the error
 
 
@@ -93,12 +99,16 @@ class DeliveryCallback(BaseCallback):
         :raises ValueError: the limit is not finite, or does not fit the costs, or ``eval_env`` is
             not normalised as the training is, has other actions, or a wrapper that is for training
             only
-        :raises OSError: the folder can't be written
+        :raises OSError: the folder can't be written, or ``certificate.json`` is of something else
         """
         self._limits()
         refuse_training_only(self.eval_env)
         sync_normalization(self.training_env, self.eval_env)
         check_agent(self.model, self.eval_env)
+        if (file := self.folder / CERTIFICATE).exists() and not (self.folder / MODEL).exists():
+            raise FileExistsError(
+                f"{file} is not of this callback, which would replace it; choose another folder"
+            )
         (self.folder / "candidates").mkdir(parents=True, exist_ok=True)
 
     def _limits(self) -> list[float]:
@@ -107,8 +117,8 @@ class DeliveryCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         self.certificate = None
-        for file in self._files():
-            steps = self._load(file)["num_timesteps"]
+        for file, candidate in self._kept():
+            steps = candidate["num_timesteps"]
             if steps > self.num_timesteps or self._candidate(steps) != file:
                 file.unlink()  # of another training
 
@@ -120,8 +130,14 @@ class DeliveryCallback(BaseCallback):
         if 2 * self.num_timesteps >= self.model._total_timesteps and not file.exists():
             self._keep(file)
 
-    def _files(self) -> list[Path]:
-        return sorted((self.folder / "candidates").glob("*.pt"))
+    def _kept(self) -> Iterator[tuple[Path, dict[str, Any]]]:
+        """Files of candidates, and what is in them; not what is damaged, or was put there."""
+        for file in sorted((self.folder / "candidates").glob("*.pt")):
+            content = None
+            with suppress(Exception):  # torch has many words for a file that it can't read
+                content = th.load(file, map_location="cpu", weights_only=True)
+            if file.stem.isdigit() and isinstance(content, dict) and content.keys() == CANDIDATE:
+                yield file, content
 
     def _candidate(self, steps: int) -> Path:
         """Where the first policy of one of equal parts of the training's last half is kept."""
@@ -131,45 +147,50 @@ class DeliveryCallback(BaseCallback):
 
     def _keep(self, file: Path) -> None:
         with replacing(file) as written:
-            content = {
-                "num_timesteps": self.num_timesteps,
-                "policy": self.model.policy.state_dict(),
-                "statistics": {
-                    name: (th.from_numpy(part.mean), th.from_numpy(part.var), float(part.count))
-                    for name, part in moments_of(self.training_env).items()
-                },
-            }
-            th.save(content, written)
+            th.save(self._policy(), written)
 
-    @staticmethod
-    def _load(file: Path) -> dict[str, Any]:
-        return th.load(file, map_location="cpu", weights_only=True)
+    def _policy(self) -> dict[str, Any]:
+        """The policy as it is now, with its observation statistics."""
+        return {
+            "num_timesteps": self.num_timesteps,
+            "policy": self.model.policy.state_dict(),
+            "statistics": {
+                name: (th.from_numpy(part.mean), th.from_numpy(part.var), float(part.count))
+                for name, part in moments_of(self.training_env).items()
+            },
+        }
 
     def _on_training_end(self) -> None:
         if self.num_timesteps < self.model._total_timesteps:  # stopped before
             return
-        last = self._candidate(self.num_timesteps)
-        self._keep(last)
-        trained = self._load(last)  # another training may write into the same folder
-        for name in ("certificate.json", MODEL, NORMALIZER):
-            (self.folder / name).unlink(missing_ok=True)
+        if not (last := self._candidate(self.num_timesteps)).exists():
+            self._keep(last)
+        trained = copy.deepcopy(self._policy())
+        kept = {candidate["num_timesteps"]: candidate for _, candidate in self._kept()}
         began = time.process_time()
         try:
-            tried = self._deliver()
+            tried = self._deliver(kept | {self.num_timesteps: trained})
         except ValueError as error:  # such as episodes without an end: the training is kept
             tried = f"Nothing is delivered: {error}"
         finally:
             self._put(trained)
+        if self.certificate is None:
+            self._withdraw()
         if self.verbose > 0:
             taken = f"({time.process_time() - began:.0f} s of a processor)"
             print(f"{tried} {taken}")
 
-    def _deliver(self) -> str:
-        """Certify the best candidate; what to say of it."""
+    def _withdraw(self) -> None:
+        """Remove the agent of an earlier training."""
+        for name in (CERTIFICATE, NORMALIZER, MODEL):  # without the first they are not taken
+            (self.folder / name).unlink(missing_ok=True)
+
+    def _deliver(self, candidates: Mapping[int, dict[str, Any]]) -> str:
+        """Certify the best of the candidates, by their steps; what to say of it."""
         limits = self._limits()
         refused: list[Certificate] = []
-        for file, deterministic in self._tries(np.array(limits)):
-            steps = self._put(self._load(file))
+        for steps, deterministic in self._tries(candidates, np.array(limits)):
+            self._put(candidates[steps])
             certificate = certify(
                 self.model,
                 self.eval_env,
@@ -186,20 +207,23 @@ class DeliveryCallback(BaseCallback):
         nearest = min(refused, key=lambda certificate: certificate.nearest.excess)
         return f"Nothing is delivered. The nearest candidate: {nearest}; {HELP}"
 
-    def _tries(self, limits: np.ndarray) -> Iterator[tuple[Path, bool]]:
+    def _tries(
+        self, candidates: Mapping[int, dict[str, Any]], limits: np.ndarray
+    ) -> Iterator[tuple[int, bool]]:
         """
-        Candidates in the order in which they are tried, and whether with their most likely actions.
+        Steps of the candidates in the order in which they are tried, and whether with their most
+        likely actions.
 
         First the one of highest return whose mean cost plus its standard error is within the limit;
         after a refusal plus twice that, then three times. If none is, the nearest.
         """
         screened = {
-            (file, deterministic): self._screen(file, deterministic, limits)
+            (steps, deterministic): self._screen(candidate, deterministic, limits)
             for deterministic in self._kinds()
-            for file in self._files()
+            for steps, candidate in candidates.items()
         }
         for caution in range(1, min(TRIES, len(screened)) + 1):
-            ranks = dict[tuple[Path, bool], tuple[bool, float]]()
+            ranks = dict[tuple[int, bool], tuple[bool, float]]()
             for candidate, (mean_return, excess, error) in screened.items():
                 most = float(np.max(excess + caution * error))
                 ranks[candidate] = (True, mean_return) if most <= 0.0 else (False, -most)
@@ -220,10 +244,10 @@ class DeliveryCallback(BaseCallback):
         return [True, False] if box and not noisy and not isinstance(policy, TD3Policy) else [True]
 
     def _screen(
-        self, file: Path, deterministic: bool, limits: np.ndarray
+        self, candidate: Mapping[str, Any], deterministic: bool, limits: np.ndarray
     ) -> tuple[float, np.ndarray, np.ndarray]:
         """Mean return, mean costs above the limits and their standard errors, shape [m]."""
-        self._put(self._load(file))
+        self._put(candidate)
         played = evaluate_policy(
             self.model, self.eval_env, self.screening, deterministic, seed=self.seed
         )
@@ -233,23 +257,28 @@ class DeliveryCallback(BaseCallback):
         error = costs.std(axis=0, ddof=1) / np.sqrt(len(costs))
         return float(played.returns.mean()), costs.mean(axis=0) - limits, error
 
-    def _put(self, content: dict[str, Any]) -> int:
+    def _put(self, content: Mapping[str, Any]) -> None:
         """Give the model and the environment the weights and statistics of a candidate."""
         self.model.policy.load_state_dict(content["policy"])
         moments = moments_of(self.eval_env)
         for name, (mean, var, count) in content["statistics"].items():
             part = moments[name]
             part.mean, part.var, part.count = mean.numpy(), var.numpy(), count
-        return int(content["num_timesteps"])
 
     def _write(self, certificate: Certificate, steps: int) -> None:
+        contents = {CERTIFICATE: certificate.to_json().encode()}
+        if (normalizer := normalizer_of(self.eval_env)) is not None:
+            contents[NORMALIZER] = pickle.dumps(normalizer)
         trained, self.model.num_timesteps = self.model.num_timesteps, steps
-        with replacing(self.folder / MODEL) as file:
-            self.model.save(file)
+        self.model.save(model := BytesIO())
         self.model.num_timesteps = trained
-        normalizer = normalizer_of(self.eval_env)
-        if normalizer is not None:
-            normalizer.save(str(self.folder / NORMALIZER))
-        with replacing(self.folder / "certificate.json") as file:  # last: it vouches for the others
-            file.write(certificate.to_json().encode())
+        contents[MODEL] = model.getvalue()
+        with ExitStack() as files:
+            # Until all are written the earlier agent stays. Then the files take their names, in
+            # reverse: the certificate, which vouches for the others, is the last one.
+            for name, content in contents.items():
+                file = files.enter_context(replacing(self.folder / name))
+                file.write(content)
+                file.flush()
+            self._withdraw()
         self.certificate = certificate

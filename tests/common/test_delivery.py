@@ -2,11 +2,13 @@
 
 import re
 import shutil
+from contextlib import ExitStack
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from full_disk import files_end_at
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -137,6 +139,78 @@ def test_a_callback_delivers_each_training_and_leaves_the_model_and_its_statisti
     assert all(th.equal(value, weights[name]) for name, value in last["policy"].items())
 
 
+def files_of(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("mine.pt", {"num_timesteps": 10**6}),
+        ("mine.pt", {"num_timesteps": 10**6, "policy": {}, "statistics": {}}),
+        ("000.pt", {"a": th.zeros(1)}),
+        ("002.pt", th.zeros(1)),
+        ("002.pt", None),  # an empty file
+    ],
+)
+def test_files_of_others_and_damaged_ones_stay_and_are_no_candidates(tmp_path, name, content):
+    folder = tmp_path / "candidates"
+    folder.mkdir()
+    (folder / name).touch()
+    if content is not None:
+        th.save(content, folder / name)
+    before = files_of(folder)
+    _, deliver = trained(tmp_path, 1.6)
+    assert files_of(folder).items() >= before.items()
+    assert deliver.certificate.verdict == "certified"
+
+
+def test_a_certificate_of_something_else_is_told_before_the_training(delivered, tmp_path):
+    text = delivered[2].certificate.to_json()  # such as sb3-guard certify --json certificate.json
+    (tmp_path / "certificate.json").write_text(text)
+    with pytest.raises(FileExistsError, match=r"certificate\.json is not of .* another folder"):
+        trained(tmp_path, 1.6)
+    assert files_of(tmp_path) == {"certificate.json": text.encode()}
+    assert [path.name for path in tmp_path.iterdir()] == ["certificate.json"]
+
+
+def test_an_interrupt_while_an_agent_is_certified_leaves_the_one_before(
+    delivered, tmp_path, monkeypatch
+):
+    shutil.copytree(delivered[0], tmp_path, dirs_exist_ok=True)
+    before = files_of(tmp_path)
+
+    def interrupt(*args, **kwargs):
+        assert files_of(tmp_path) == before
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sb3_guard.common.delivery.certify", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        trained(tmp_path, 1.6, seed=1)
+    assert files_of(tmp_path) == before
+    monkeypatch.undo()
+    assert trained(tmp_path, 1.6, seed=1)[1].certificate.verdict == "certified"
+    after = files_of(tmp_path)
+    assert after.keys() == before.keys() and all(after[name] != before[name] for name in after)
+
+
+def test_an_agent_that_the_disk_has_no_room_for_leaves_the_one_before(
+    delivered, tmp_path, monkeypatch
+):
+    shutil.copytree(delivered[0], tmp_path, dirs_exist_ok=True)
+    before = files_of(tmp_path)
+    full = ExitStack()
+
+    def certified(*args, **kwargs):
+        full.enter_context(files_end_at(len(before["certified_model.zip"]) // 2))
+        return delivered[2].certificate
+
+    monkeypatch.setattr("sb3_guard.common.delivery.certify", certified)
+    with full, pytest.raises(OSError, match="too large"):
+        trained(tmp_path, 1.6, seed=1)
+    assert files_of(tmp_path) == before
+
+
 class Restless(Dose):
     """An action costs three times the limit if it is the last one again, else nothing."""
 
@@ -195,22 +269,19 @@ def test_actions_that_are_sampled_alike_or_not_exported_are_not_tried(
     ],
 )
 def test_three_tries_the_best_first_then_more_cautious(screened, tried, tmp_path, monkeypatch):
-    (tmp_path / "candidates").mkdir()
-    for name in "012345":
-        (tmp_path / "candidates" / f"{name}.pt").touch()
     model, env = restless()
     deliver = DeliveryCallback(env, tmp_path)
     deliver.init_callback(model)
 
-    def screen(file, deterministic, limits):
-        name = "s" * (not deterministic) + file.stem
-        above = 2.0 - int(file.stem) / 10 + 0.01 * (not deterministic)
+    def screen(steps, deterministic, limits):
+        name = "s" * (not deterministic) + str(steps)
+        above = 2.0 - steps / 10 + 0.01 * (not deterministic)
         mean_return, excess = screened.get(name, (99.0, above))
         return mean_return, np.array([-9.0, excess]), np.array([0.1, 0.1])
 
     monkeypatch.setattr(deliver, "_screen", screen)
-    tries = deliver._tries(np.ones(1))
-    assert " ".join("s" * (not most_likely) + file.stem for file, most_likely in tries) == tried
+    tries = deliver._tries({steps: steps for steps in range(6)}, np.ones(1))
+    assert " ".join("s" * (not most_likely) + str(steps) for steps, most_likely in tries) == tried
 
 
 class TwoCosts(Dose):
@@ -227,19 +298,19 @@ def test_the_screening_of_several_costs(tmp_path, monkeypatch):
     model = CPO("MlpPolicy", env, cost_limit=[1.0, 4.0], seed=0, **keys)
     deliver = DeliveryCallback(env, tmp_path, screening=20)
     deliver.init_callback(model)
-    deliver._keep(file := tmp_path / "candidates" / "000.pt")
+    candidate = deliver._policy()
     for deterministic in True, False:
         th.manual_seed(0)
         played = evaluate_policy(model, env, 20, deterministic, seed=deliver.seed)
         th.manual_seed(0)
-        mean_return, excess, error = deliver._screen(file, deterministic, np.array([1.0, 4.0]))
+        mean_return, excess, error = deliver._screen(candidate, deterministic, np.array([1.0, 4.0]))
         assert mean_return == pytest.approx(played.returns.mean())
         assert excess == pytest.approx(played.limited.mean(axis=0) - [1.0, 4.0])
         assert error == pytest.approx(played.limited.std(axis=0, ddof=1) / 20**0.5)
     # Episodes without an end, or that ended in a physics error: only a first try, for a verdict
     played.limited[3, 1] = np.nan
     monkeypatch.setattr("sb3_guard.common.delivery.evaluate_policy", lambda *args, **kwargs: played)
-    assert list(deliver._tries(np.array([1.0, 4.0]))) == [(file, True)]
+    assert list(deliver._tries({7: candidate}, np.array([1.0, 4.0]))) == [(7, True)]
 
 
 class Endless(Dose):

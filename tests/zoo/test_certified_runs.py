@@ -1,6 +1,7 @@
 """A run that ends with a certified agent: trained, cut and continued, played, exported."""
 
 import json
+import shutil
 from contextlib import closing
 
 import pytest
@@ -98,6 +99,39 @@ def test_a_certificate_of_another_agent_is_not_shown(run, capsys):
     assert enjoy.main(here) == 0
     assert "certified: mean cost" not in capsys.readouterr().out
     file.write_text(before)
+
+
+DAMAGES = {
+    "text for a number": lambda content: content.update(mean_return="high"),
+    "a number for a cost": lambda content: content["costs"].update(cost=3.0),
+    "no costs": lambda content: content.update(costs={}),
+    "a cost without its limit": lambda content: content["costs"]["cost"].pop("limit"),
+    "a number that is none": lambda content: content["costs"]["cost"].update(upper=float("nan")),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_certificate_is_a_line(run, capsys, tmp_path, damage):
+    file = run / "certificate.json"
+    before = file.read_text()
+    DAMAGES[damage](content := json.loads(before))
+    file.write_text(json.dumps(content))
+    here = ["-f", str(run), *TOY[:2]]
+    try:
+        refused(enjoy.main, [*here, "--no-render"], capsys, f"{file} is damaged: ")
+        refused(hub.main, [str(run), "-o", str(tmp_path / "agent")], capsys, f"{file} is damaged: ")
+        assert not (tmp_path / "agent").exists()
+    finally:
+        file.write_text(before)
+
+
+def test_a_damaged_candidate_is_left_out(run, capsys, tmp_path):
+    shutil.copytree(run, folder := tmp_path / "run")
+    (folder / "result.json").unlink()
+    (folder / "candidates" / "002.pt").write_bytes(b"")
+    assert train.main(["-i", str(folder), *TOY[:2], "--verbose", "0"]) == 0
+    certificate = Certificate.from_json((folder / "certificate.json").read_text())
+    assert certificate.verdict == "certified"
 
 
 @pytest.mark.parametrize("step", [230, pytest.param(150, marks=pytest.mark.slow)])

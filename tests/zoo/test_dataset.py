@@ -8,6 +8,7 @@ import signal
 import gymnasium as gym
 import numpy as np
 import pytest
+from full_disk import files_end_at
 from gymnasium import spaces
 from killed import SMALL, TOY
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -248,12 +249,43 @@ def test_an_interrupt_leaves_whole_episodes(kind, number, tmp_path, monkeypatch,
     assert enjoy.main([*PLAY[:-4], *steps, name]) == 130
     assert chunks == [50, 50]
     assert "Dataset: 100 episodes in " in capsys.readouterr().out
-    if kind is MinariDataset:
-        dataset = minari.load_dataset(name)
-        assert [len(episode) for episode in dataset.iterate_episodes()] == [5] * 100
-    else:
-        with h5py.File(name) as file:
-            assert file["timeouts"][4::5].all() and len(file["timeouts"]) == 500
+    assert whole_episodes(name) == 100
+
+
+def whole_episodes(name):
+    """How many episodes of five steps a dataset has, and nothing else."""
+    if not name.endswith(".hdf5"):
+        lengths = [len(episode) for episode in minari.load_dataset(name).iterate_episodes()]
+        assert {*lengths} == {5}
+        return len(lengths)
+    with h5py.File(name) as file:
+        ends = np.flatnonzero(file["timeouts"])
+        assert all(len(values) == 5 * len(ends) for values in file.values())
+        np.testing.assert_array_equal(ends, np.arange(4, 5 * len(ends), 5))
+        assert np.abs(file["observations"][:]).sum(axis=1).all()
+        return len(ends)
+
+
+@pytest.mark.parametrize("name", ["full-v0", "full.hdf5"])
+def test_a_full_disk_leaves_whole_episodes(name, tmp_path, capsys):
+    """They are those that the message counts."""
+    name = str(tmp_path / name) if name.endswith(".hdf5") else name
+    steps = "--n-episodes 200 --env-kwargs max_episode_steps:5 --dataset".split()
+    with files_end_at(500_000 if name.endswith(".hdf5") else 4_000_000):
+        assert enjoy.main([*PLAY, *steps, name]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: can't write --dataset {name}: ") and error.count("\n") == 1
+    assert whole_episodes(name) == int(re.search("; it has ([0-9]+) whole episodes$", error)[1])
+
+
+@pytest.mark.parametrize("name", ["none-v0", "none.hdf5"])
+def test_a_disk_that_is_full_before_leaves_nothing(name, tmp_path, capsys):
+    place = tmp_path / name
+    steps = "--n-episodes 2 --env-kwargs max_episode_steps:5 --dataset".split()
+    with files_end_at(1000):
+        assert enjoy.main([*PLAY, *steps, str(place) if place.suffix else name]) == 2
+    assert capsys.readouterr().err.endswith("File too large; it has no whole episodes\n")
+    assert not place.exists() and not [*tmp_path.glob("minari/**/*.hdf5")]
 
 
 def test_nothing_is_left_if_no_episode_ends(tmp_path, capsys):

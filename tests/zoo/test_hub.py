@@ -1,10 +1,11 @@
 """Agents for the hub: what is uploaded, and that it is played as it was."""
 
 import shlex
+import shutil
 
 import pytest
 import yaml
-from typed import PLAY, trained
+from typed import PLAY, refused, trained
 
 from sb3_guard import enjoy, hub, train
 from sb3_guard.zoo.agents.flags import EnjoyFlags
@@ -74,3 +75,63 @@ def test_what_was_written_is_played_alike(run, tmp_path, capsys):
 def test_a_folder_that_can_not_be_written(run, capsys):
     assert hub.main([str(run), "-o", "/dev/null/x"]) == 2
     assert "can't write to /dev/null/x: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "name", ["certified_model.zip", "best_model.zip", "0.monitor.csv", "Filmed-v0/config.yml"]
+)
+def test_a_link_to_a_file_elsewhere_is_not_uploaded(run, tmp_path, capsys, name):
+    copied, private = tmp_path / "run", tmp_path / "private"
+    shutil.copytree(run, copied)
+    (copied / name).unlink(missing_ok=True)
+    private.write_text("a: secret")
+    (copied / name).symlink_to("../" * (1 + name.count("/")) + "private")
+    refused(hub.main, [str(copied), "-o", str(tmp_path / "agent")], capsys, name, "is a link")
+    assert not (tmp_path / "agent").exists()
+
+
+def test_a_link_within_the_run_is_a_file_of_it(run, tmp_path):
+    copied = tmp_path / "run"
+    shutil.copytree(run, copied)
+    (copied / "certified_model.zip").symlink_to("Filmed-v0.zip")
+    (tmp_path / "link").symlink_to("run")
+    staged(tmp_path / "link", tmp_path / "agent")
+    uploaded = tmp_path / "agent" / "certified_model.zip"
+    assert uploaded.read_bytes() == (run / "Filmed-v0.zip").read_bytes()
+    assert not uploaded.is_symlink()
+
+
+def test_a_folder_holds_the_last_agent_alone(run, tmp_path):
+    other, folder = tmp_path / "Other-v0_1", tmp_path / "agent"
+    shutil.copytree(run, other)
+    for name in ("certified_model.zip", "best_model.zip"):
+        (other / name).touch()
+    (other / "Filmed-v0.zip").rename(other / "Other-v0.zip")
+    (other / "Filmed-v0").rename(other / "Other-v0")
+    args = other / "Other-v0" / "args.yml"
+    args.write_text(args.read_text().replace("Filmed-v0", "Other-v0"))
+    staged(other, folder)
+    (folder / ".gitattributes").touch()  # of a clone
+    staged(run, folder)
+    staged(run, tmp_path / "alone")
+    names = {path.relative_to(folder) for path in folder.rglob("*")}
+    alone = {path.relative_to(tmp_path / "alone") for path in (tmp_path / "alone").rglob("*")}
+    assert {path.name for path in names - alone} == {".gitattributes"} and names > alone
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "Filmed-v0/notes.txt", "Filmed-v0.zip"])
+def test_files_of_others_are_not_overwritten(run, tmp_path, capsys, name):
+    folder = tmp_path / "agent"
+    if name != "Filmed-v0.zip":  # among those of an agent
+        staged(run, folder)
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_text("mine")
+    before = {path: path.stat() for path in folder.rglob("*")}
+    refused(hub.main, [str(run), "-o", str(folder)], capsys, f"{folder} holds", name, "-o")
+    assert {path: path.stat() for path in folder.rglob("*")} == before
+
+
+def test_a_run_is_not_written_into_its_own_folder(run, capsys):
+    before = {path: path.stat() for path in run.rglob("*")}
+    refused(hub.main, [str(run), "-o", str(run)], capsys, "which this command has not written")
+    assert {path: path.stat() for path in run.rglob("*")} == before

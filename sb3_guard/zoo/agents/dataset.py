@@ -7,11 +7,14 @@ written as they end, so that memory holds only those under way.
 import copy
 import importlib.util
 import json
+import os
+import pickle
 import shlex
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import gymnasium
@@ -25,13 +28,14 @@ from sb3_guard.common.monitor import cost_keys_of, find_monitor, total_cost
 from sb3_guard.costs import bounded_name, number
 from sb3_guard.vector import each
 from sb3_guard.zoo.agents.flags import EnjoyFlags
-from sb3_guard.zoo.cli.usage import UsageError, interrupts
+from sb3_guard.zoo.cli.usage import UsageError, explained, interrupts
 
 #: A whole episode of T steps in Minari's words: ``observations`` [T + 1, ...], or a dictionary of
 #: such, ``actions`` [T, ...], ``rewards``, ``terminations``, ``truncations`` [T], and ``infos``, of
 #: ``"cost"`` and each cost key that was reported, [T + 1]: 0 at the reset, then those of the steps.
 Episode = dict[str, Any]
 DSRL = ".hdf5"  # how the name of a file ends; other names are Minari's
+CHUNK = 2**14  # bytes of an array that HDF5 stores together
 
 
 class Recorder(VecEnvWrapper):
@@ -111,6 +115,29 @@ def _episode(first: Any, steps: list[tuple[Any, ...]]) -> Episode:
     }
 
 
+def take_room(file: Path, values: int, records: int) -> None:
+    """
+    Lengthen a file, so that HDF5 has room to write; it cuts off what it does not need.
+
+    On a full disk HDF5 leaves a damaged file behind, and crashes when the process ends.
+
+    :param file: the file; it may be absent, then there only must be room
+    :param values: bytes of what HDF5 is given
+    :param records: bytes of its own records of them
+    :raises OSError: there is no room; the file is as it was
+    """
+    size = values + values // 4 + records + 2**16
+    folder = next(folder for folder in file.parents if folder.is_dir())
+    with open(file, "r+b", 0) if file.exists() else TemporaryFile(buffering=0, dir=folder) as room:
+        end = room.seek(0, os.SEEK_END)
+        try:
+            while (left := end + size - room.tell()) > 0:
+                room.write(bytes(min(left, 2**20)))
+        except OSError:
+            room.truncate(end)
+            raise
+
+
 class MinariDataset:
     """
     A dataset of Minari's, in its folder of datasets; it is made with its first episodes.
@@ -148,6 +175,10 @@ class MinariDataset:
         import minari
         from minari.data_collector import EpisodeBuffer
 
+        infos, several = episodes[0]["infos"], getattr(self.venv.observation_space, "spaces", ())
+        arrays = len(episodes) * (8 + len(infos) + len(several))
+        file = self.place / "data" / "main_data.hdf5"
+        take_room(file, len(pickle.dumps(episodes)), 2**12 * arrays)
         buffers = [EpisodeBuffer(**episode) for episode in episodes]
         if self.dataset is not None:
             self.dataset.update_dataset_from_buffer(buffers)
@@ -202,16 +233,21 @@ class DSRLFile:
             }
             for episode in episodes
         ]
+        joined = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
         self.place.parent.mkdir(parents=True, exist_ok=True)
+        take_room(self.place, sum(new.nbytes for new in joined.values()), CHUNK * len(joined))
         with h5py.File(self.place, "a") as file:
             file.attrs["metadata"] = json.dumps(self.about)
-            for key in parts[0]:
-                new = np.concatenate([part[key] for part in parts])
+            for key, new in joined.items():
                 if key in file:
                     file[key].resize(len(file[key]) + len(new), axis=0)
                     file[key][-len(new) :] = new
                 else:
-                    file.create_dataset(key, data=new, maxshape=(None, *new.shape[1:]))
+                    shape = new.shape[1:]
+                    rows = max(CHUNK // new[0].nbytes, 1)
+                    file.create_dataset(
+                        key, data=new, maxshape=(None, *shape), chunks=(rows, *shape)
+                    )
 
 
 @contextmanager
@@ -245,7 +281,9 @@ def recording(agent: Any, flags: EnjoyFlags, n_episodes: int) -> Iterator[None]:
 
     def write(episodes: list[Episode]) -> None:
         nonlocal written
-        dataset.write(episodes)
+        fix = f"it has {written or 'no'} whole episodes"
+        with explained(f"can't write --dataset {name}", OSError, fix=fix):
+            dataset.write(episodes)
         written += len(episodes)
 
     try:

@@ -93,10 +93,8 @@ def answered(env: VectorEnv) -> Iterator[None]:
                 process.terminate()
             envs.closed = True  # its close() would wait for answers that do not come
             if isinstance(error, Exception):
-                raise ConnectionError(
-                    f"a process of {type(envs).__name__} has died, because of an error printed "
-                    "above, by a signal or for lack of memory"
-                ) from error
+                why = "because of an error printed above, by a signal or for lack of memory"
+                raise ConnectionError(f"a process of AsyncVectorEnv has died, {why}") from error
         raise
 
 
@@ -258,11 +256,11 @@ class TensorVecEnv(BatchVecEnv):
     """A simulator that steps torch tensors of N rows, as mjlab and Isaac Lab do.
 
     ``step`` returns observations by group, reward, terminated, truncated and ``extras``, and begins
-    new episodes in rows that have ended; with ``cfg.auto_reset=False`` it leaves that to
-    ``reset(env_ids=rows)``. All that Stable-Baselines3 needs of a step leaves the device in one
-    copy. The last observation of an episode is that in ``extras["final_obs"]`` (by group, of N
-    rows), or what such a simulator without resets shows; else the one before it stands in. An end
-    is a time-out by ``extras["time_outs"]``, [N], or if the row is truncated, not terminated.
+    new episodes in rows that have ended; with ``cfg.auto_reset=False``, ``reset(env_ids=rows)``
+    does. All that Stable-Baselines3 needs of a step leaves the device in one copy, new episodes in
+    another. Last observations are those of a step without resets, or ``extras["final_obs"]``, N
+    rows by group; else the ones before them stand in. A row that is truncated and not terminated
+    has timed out, and any row that has ended of which ``extras["time_outs"]``, [N], is true.
 
     :param env: the simulator, with ``num_envs``, ``device``, ``max_episode_length`` and the spaces
         of a row
@@ -282,24 +280,23 @@ class TensorVecEnv(BatchVecEnv):
         clip_actions: float = 5.0,
     ) -> None:
         inner = getattr(env, "unwrapped", env)  # Gymnasium's wrappers pass no attributes on
+        name = type(inner).__name__
         if not hasattr(inner, "device"):
-            raise TypeError(f"{type(inner).__name__} has no device: algorithms take it as it is")
+            raise TypeError(f"{name} has no device: algorithms take it as it is")
         if is_wrapped(env, TimeLimit):
             raise TypeError(
-                f"a TimeLimit ends all rows at once: set {type(inner).__name__}'s own length of an "
-                "episode, and register it without max_episode_steps"
+                f"a TimeLimit ends all rows at once: set the episode length of {name} itself, and "
+                "register it without max_episode_steps"
             )
         self.auto_reset = getattr(getattr(inner, "cfg", None), "auto_reset", True)
         self.device, groups = inner.device, inner.single_observation_space.spaces
-        first = next(name for name in ("policy", "actor", *groups) if name in groups)
+        first = next(key for key in ("policy", "actor", *groups) if key in groups)
         self.group = fit("group", group or first, choices=[*groups])
         self.cost = cost
         bound = np.full(inner.single_action_space.shape, clip_actions, np.float32)
         seen = spaces.Box(-np.inf, np.inf, groups[self.group].shape)
         super().__init__(env, inner.num_envs, seen, spaces.Box(-bound, bound))
-        self.spec = EnvSpec(
-            f"{type(inner).__name__}-v0", max_episode_steps=inner.max_episode_length
-        )
+        self.spec = EnvSpec(f"{name}-v0", max_episode_steps=inner.max_episode_length)
         self._tensor, self._obs = th.zeros(0), np.zeros(0)  # the same, on the device and here
 
     def reset(self) -> np.ndarray:
@@ -345,8 +342,7 @@ class TensorVecEnv(BatchVecEnv):
         shown = together[:, 5:].reshape(self._obs.shape)
         dones, cut = died + cut > 0.0, (late > 0.0) | (cut > died)
         infos: list[dict[str, Any]] = [{"cost": cost} for cost in costs.tolist()]
-        rows = np.flatnonzero(dones).tolist()
-        lost = self.auto_reset and final is None
+        rows, lost = np.flatnonzero(dones).tolist(), self.auto_reset and final is None
         for i in rows:
             infos[i]["TimeLimit.truncated"] = bool(cut[i])
             infos[i]["terminal_observation"] = (self._obs if lost else shown)[i]

@@ -194,7 +194,7 @@ class LastOfFew(Simulator):
         (lambda: stepped(lambda *_: th.zeros(N, 1)), "is no tensor of 4 numbers"),
         (
             lambda: TensorVecEnv(gym.wrappers.TimeLimit(Gymnasiums(), 5)),
-            "TimeLimit ends all rows at once: set Gymnasiums's own length",
+            "TimeLimit ends all rows at once: set the episode length of Gymnasiums",
         ),
         (lambda: stepped("cost", FourValues()), "step returned 4 values, not five"),
         (lambda: stepped("cost", LastOfFew()), r"'final_obs'\] has no tensor of shape \(4, 2\)"),

@@ -693,9 +693,8 @@ class Run:
             if checkpoints.asked_to_stop():  # the signal was for all processes
                 return False
             raise UsageError(
-                f"a process of --vec-env {self.flags.vec_env} has died, because of an error "
-                "printed above, by a signal or for lack of memory; continue with: "
-                f"{folder.again(self.flags)}"
+                f"a process of --vec-env {self.flags.vec_env} has died, by an error told above, a "
+                f"signal or for lack of memory; continue with: {folder.again(self.flags)}"
             ) from error
         return True
 

@@ -85,9 +85,8 @@ def answered(env: VectorEnv) -> Iterator[None]:
     try:
         yield
     except (Exception, KeyboardInterrupt) as error:
-        envs = env.unwrapped
+        envs = env.unwrapped  # without a pipe to a process that has told of an error
         gone = isinstance(error, EOFError | ConnectionError | KeyboardInterrupt)
-        # a pipe is None if its process has told of an error
         if isinstance(envs, AsyncVectorEnv) and (gone or None in envs.parent_pipes):
             for process in envs.processes:
                 process.terminate()
@@ -321,8 +320,9 @@ class TensorVecEnv(BatchVecEnv):
             )
         obs, reward, terminated, truncated, extras = step
         before, now = self._tensor, obs[self.group].clone()
-        final = extras.get("final_obs")
-        last = now if final is None else isinstance(final, Mapping) and final.get(self.group)
+        final, last = extras.get("final_obs"), now
+        if final is not None:
+            last = final.get(self.group) if isinstance(final, Mapping) else final
         late = extras.get("time_outs", th.zeros_like(reward))
         for name, tensor, like in ("final_obs", last, now), ("time_outs", late, reward):
             if getattr(tensor, "shape", None) != like.shape:

@@ -34,7 +34,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_guard import make_vec_env, train
 from sb3_guard.common import vec_env
-from sb3_guard.zoo.cli.usage import UsageError
+from sb3_guard.zoo.cli.usage import UsageError, import_packages
 from sb3_guard.zoo.run import checkpoint
 from sb3_guard.zoo.run import run as run_module
 from sb3_guard.zoo.run.checkpoint import read_checkpoint
@@ -258,6 +258,7 @@ def test_asked_to_stop(undisturbed, tmp_path, monkeypatch, capsys):
 def test_processes_of_environments_die(asked, vec_env, forked, tmp_path, monkeypatch, capsys):
     """For want of memory, or by a SIGTERM to the whole process group, as batch systems send it."""
     whole = Epochs._on_step
+    import_packages(["registered_envs"])
     monkeypatch.setattr(gym.spec("CostPoint-v0"), "vector_entry_point", in_processes)
 
     def step(self):

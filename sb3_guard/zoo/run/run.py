@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, suppress
 from dataclasses import dataclass, field
 from functools import cached_property
+from multiprocessing.util import register_after_fork
 from pathlib import Path
 from typing import Any, Self
 
@@ -342,6 +343,9 @@ class Run:
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
             import_packages(packages)  # which a process of its own has not imported
             return source.make(**arguments)
+
+        if vec_env == "gymnasium":  # the same, for processes that the environment starts itself
+            register_after_fork(self, lambda _: signal.signal(signal.SIGINT, signal.SIG_IGN))
 
         def wrap(env: gym.Env) -> gym.Env:
             for cls, arguments in single:
@@ -694,10 +698,12 @@ class Run:
                 f"training stopped at {self.model.num_timesteps} steps: {one_line(error)}"
             ) from error
         except PROCESS_DIED as error:
-            if self.flags.vec_env != "subproc":
+            if self.flags.vec_env not in ("subproc", "gymnasium"):
                 raise
+            if checkpoints.asked_to_stop():  # the signal was for all processes
+                return False
             raise UsageError(
-                "a process of --vec-env subproc has died, because of an error printed above, by a "
+                f"a process of --vec-env {self.flags.vec_env} has died, by an error told above, a "
                 f"signal or for lack of memory; continue with: {folder.again(self.flags)}"
             ) from error
         return True

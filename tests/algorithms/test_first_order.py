@@ -269,6 +269,10 @@ def test_crpo_lowers_the_cost_that_is_most_above_its_limit(costs: Any, worst: An
     rows = batch([1.0, 2.0], [[3.0, 5.0], [4.0, 6.0]])
     expected = [1.0, 2.0] if worst is None else [[-3.0, -4.0], [-5.0, -6.0]][worst]
     assert model.advantages(rows).tolist() == expected
+    model.cost_limit = [2.0, 0.0]  # of which any cost is one unit
+    for cost, worst in ((4.0, 1), (5.0, 0)):
+        told(model, [cost, 9.0], 30.0)
+        assert model.violated == worst
 
 
 def test_rcpo_takes_the_whole_step() -> None:

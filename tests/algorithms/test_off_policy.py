@@ -96,8 +96,35 @@ def test_while_the_limit_holds_it_is_sb3s_bit_for_bit(ours: Any, theirs: Any, mo
             logged[f"train/{name}"], rel=1e-6
         ), name
     assert model.logger.name_to_value["train/cost_critic_loss"] > 0.0
-    # A limit that is broken makes another run of it.
-    assert state_of(ours("MlpPolicy", VecNormalize(points()), **kwargs()).learn(200)) != state
+
+
+@every
+def test_the_actor_descends_the_lagrangian(cls: Any) -> None:
+    """Its loss and gradient by hand, (α log π - Q + Σ λ_i Q_Ci) / (1 + Σ λ_i); α is 0 in TD3."""
+    more = settings() | {"cost_keys": ("cost", "again"), "missing_cost": "zero", "cost_limit": 1.0}
+    more |= {} if cls is TD3Lag else {"ent_coef": 0.1}
+    model = cls("MlpPolicy", points(), lambda_units="cost", **more).learn(80)
+    for part in (model.actor, model.critic, model.cost_critic):
+        part.optimizer.param_groups[0]["lr"] = 0.0
+    model.prices, model._n_updates = np.array([0.5, 2.0]), 2  # an update of TD3's actor, too
+    batch, weights = model.replay_buffer.sample(8), [*model.actor.parameters()]
+    th.manual_seed(1)
+    loss = model.learn_from(batch, 0)["actor_loss"]
+    gradient = [part.grad.clone() for part in weights]
+
+    th.manual_seed(1)
+    at, entropy = batch.observations, 0.0
+    if cls is TD3Lag:
+        actions = model.actor(at)
+        value = model.critic.q1_forward(at, actions)[:, 0]
+    else:
+        actions, log_prob = model.actor.action_log_prob(at)
+        values, entropy = model.critic(at, actions), 0.1 * log_prob
+        value = values.mean((1, 2)) if cls is TQCLag else th.min(*values)[:, 0]
+    costs = model.cost_critic(at, actions)
+    expected = ((entropy - value + 0.5 * costs[:, 0] + 2.0 * costs[:, 1]) / 3.5).mean()
+    assert loss == pytest.approx(expected.item(), rel=1e-5)
+    th.testing.assert_close(gradient, [*th.autograd.grad(expected, weights)])
 
 
 @shared
@@ -363,9 +390,11 @@ def test_a_training_moves_multipliers_as_far_however_many_episodes_it_has(
 
 
 def paid(size: float) -> Any:
-    """Two environments that pay ``size`` and its negative by turns."""
+    """Two environments with two action dimensions that pay ``size`` and its negative by turns."""
 
     class Paid(Clock):
+        action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+
         def step(self, action: Any) -> Any:
             observation, _, *others = super().step(action)
             return observation, size * (-1.0) ** self.t, *others
@@ -376,7 +405,7 @@ def paid(size: float) -> Any:
 @pytest.mark.parametrize(
     ("ent_coef", "size", "start"),
     [
-        ("auto_reward", 0.02, 0.02),
+        ("auto_reward", 0.02, 0.01),
         ("auto_reward", 0.0, 1.0),  # nothing to go by
         ("auto", 0.02, 1.0),
         ("auto_0.1", 0.02, 0.1),
@@ -385,7 +414,7 @@ def paid(size: float) -> Any:
 def test_the_entropy_coefficient_starts_where_it_is_told(
     ent_coef: str, size: float, start: float
 ) -> None:
-    """One action dimension, so that the mean absolute reward is the start; once, not at each."""
+    """At the mean absolute reward by the number of action dimensions; once, not at each."""
     model = SACLag("MlpPolicy", paid(size), ent_coef=ent_coef, cost_limit=1e6, **settings())
     model.learn(62)
     assert model._n_updates == 1
@@ -395,6 +424,13 @@ def test_the_entropy_coefficient_starts_where_it_is_told(
     model.set_env(paid(1000.0))
     model.learn(4, reset_num_timesteps=False)
     assert float(model.log_ent_coef.exp()) == pytest.approx(start, rel=0.01)
+
+
+def test_the_entropy_coefficient_starts_at_the_rewards_that_are_learnt_from() -> None:
+    env = VecNormalize(paid(20.0), gamma=0.0)
+    model = SACLag("MlpPolicy", env, cost_limit=1e6, **settings()).learn(62)
+    start = env.normalize_reward(np.array(20.0)) / 2
+    assert float(model.log_ent_coef.exp()) == pytest.approx(float(start), rel=1e-3)
 
 
 @shared

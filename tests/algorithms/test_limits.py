@@ -111,6 +111,11 @@ def test_every_update_has_the_limit_of_its_time(cls: Any, limit: Any, tmp_path: 
     assert evaluate_policy(again, env, n_eval_episodes=1).limits == (2.0,)
 
 
+def test_a_rollout_beyond_the_end_of_the_training_has_the_last_limit() -> None:
+    model = CPO("MlpPolicy", points(), cost_limit="lin_4_2", n_steps=40).learn(100)
+    assert model.num_timesteps == 160 and model.costs.limits.tolist() == [2.0]
+
+
 def test_an_agent_is_judged_by_the_last_limit(tmp_path: Path) -> None:
     model = CPO("MlpPolicy", points(), cost_limit="lin_4_2")
     callback = CostEvalCallback(points(), n_eval_episodes=1)

@@ -100,17 +100,20 @@ def test_while_the_limit_holds_it_is_sb3s_bit_for_bit(ours: Any, theirs: Any, mo
 
 @every
 def test_the_actor_descends_the_lagrangian(cls: Any) -> None:
-    """Its loss and gradient by hand, (α log π - Q + Σ λ_i Q_Ci) / (1 + Σ λ_i); α is 0 in TD3."""
+    """Its loss and gradient by hand, (α log π - Q + Σ w_i Q_Ci) / (1 + Σ λ_i); α is 0 in TD3.
+
+    w_i is λ_i in standard deviations of Q over those of Q_Ci, of the batch's own actions.
+    """
     more = settings() | {"cost_keys": ("cost", "again"), "missing_cost": "zero", "cost_limit": 1.0}
     more |= {} if cls is TD3Lag else {"ent_coef": 0.1}
-    model = cls("MlpPolicy", points(), lambda_units="cost", **more).learn(80)
+    model = cls("MlpPolicy", points(), **more).learn(80)
     for part in (model.actor, model.critic, model.cost_critic):
         part.optimizer.param_groups[0]["lr"] = 0.0
     model.prices, model._n_updates = np.array([0.5, 2.0]), 2  # an update of TD3's actor, too
-    batch, weights = model.replay_buffer.sample(8), [*model.actor.parameters()]
+    batch, moved = model.replay_buffer.sample(8), [*model.actor.parameters()]
     th.manual_seed(1)
     loss = model.learn_from(batch, 0)["actor_loss"]
-    gradient = [part.grad.clone() for part in weights]
+    gradient = [part.grad.clone() for part in moved]
 
     th.manual_seed(1)
     at, entropy = batch.observations, 0.0
@@ -121,10 +124,13 @@ def test_the_actor_descends_the_lagrangian(cls: Any) -> None:
         actions, log_prob = model.actor.action_log_prob(at)
         values, entropy = model.critic(at, actions), 0.1 * log_prob
         value = values.mean((1, 2)) if cls is TQCLag else th.min(*values)[:, 0]
-    costs = model.cost_critic(at, actions)
-    expected = ((entropy - value + 0.5 * costs[:, 0] + 2.0 * costs[:, 1]) / 3.5).mean()
+    replayed = model.critic(at, batch.actions)
+    replayed = replayed.mean((1, 2)) if cls is TQCLag else replayed[0]
+    spread = model.cost_critic(at, batch.actions).std(0, correction=0)
+    weight = (th.tensor([0.5, 2.0]) * replayed.std(correction=0) / spread).detach()
+    expected = ((entropy - value + model.cost_critic(at, actions) @ weight) / 3.5).mean()
     assert loss == pytest.approx(expected.item(), rel=1e-5)
-    th.testing.assert_close(gradient, [*th.autograd.grad(expected, weights)])
+    th.testing.assert_close(gradient, [*th.autograd.grad(expected, moved)])
 
 
 @shared
@@ -307,17 +313,6 @@ def test_networks_side_by_side_are_networks() -> None:
             x = x @ layer.weight[k] + layer.bias[k]
             x = x if i == 4 else x.relu()
         th.testing.assert_close(together[:, k], x)
-
-
-def test_the_weight_of_a_cost_by_hand() -> None:
-    model = SACLag("MlpPolicy", points(), lambda_init=2.0, **settings()).learn(120)
-    model.prices = np.array([0.5])
-    batch, values = model.replay_buffer.sample(8), th.arange(8.0).reshape(8, 1)
-    model.cost_critic.optimizer.param_groups[0]["lr"] = 0.0
-    model.fit_cost_critic(batch, batch.actions)  # which keeps the deviation of this batch
-    with th.no_grad():
-        spread = values.std(correction=0) / model.cost_critic(*batch[:2]).std(0, correction=0)
-    th.testing.assert_close(model.batch_weights(values), 0.5 * spread)
 
 
 @shared

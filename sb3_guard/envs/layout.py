@@ -70,7 +70,7 @@ class Footprint:
     :param height: z, m, or a range to draw z from, after x and y
     :param reach: greatest distance of (x, y, z) from ``reach_center``, m
     :param reach_center: the point that the robot's reach is measured from, (x, y, z) m
-    :param hand: places of the robot's hand, [n, 3] m: a centre is within reach / 20 of one
+    :param hand: places of the robot's hand, [n, 3] m: a centre is within reach / 15 of one
     :param mover: whether it moves by itself, so that a new goal may ignore it in need
     :param redrawn: whether the first object is drawn again within an episode
     :param last: whether it is also drawn again once everything else has its place
@@ -160,7 +160,7 @@ class Footprint:
         if self.hand is None:
             return low + rng.random(len(xy)) * (high - low)
         gaps = self._gaps(self.hand, xy.T)  # a place near by, drawn, or the nearest
-        ranks = np.where(gaps < (self.reach / 20) ** 2, -rng.random(gaps.shape), gaps)
+        ranks = np.where(gaps < (self.reach / 15) ** 2, -rng.random(gaps.shape), gaps)
         return np.clip(self.hand[ranks.argmin(axis=1), 2], low, high)
 
     @property
@@ -179,8 +179,8 @@ class Footprint:
         x, y, z = self.reach_center
         dx, dy = draws[0] - x, draws[1] - y
         far: Array = dx**2 + dy**2 > self.reach**2 - (np.clip(z, *self._range) - z) ** 2
-        if self.hand is not None:
-            far |= self._gaps(self.hand, draws).min(axis=-1) > (self.reach / 20) ** 2
+        if self.hand is not None and not self.among:
+            far |= self._gaps(self.hand, draws).min(axis=-1) > (self.reach / 15) ** 2
         return far
 
 

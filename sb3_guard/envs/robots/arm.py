@@ -50,7 +50,7 @@ class FileArm(MJCFRobot):
     """An arm of anybody's file: a link is the capsule around a geom that meets something."""
 
     heading: float = param(0.0, "heading, rad")  # never random: not all arms turn all around
-    near: ClassVar[tuple[str, ...]] = ("goal", "hazards", "ghosts")  # drawn where the hand can be
+    near: ClassVar[tuple[str, ...]] = ("goal", "hazards", "ghosts")  # parts in its reach
     shoulder: ClassVar[Array]  # where its first joint is in the file, [3] m
     places: ClassVar[Array]  # where its end effector can be, [n, 3] m, likewise
 
@@ -61,10 +61,8 @@ class FileArm(MJCFRobot):
         self.hand = self.places @ turn + self.reach_center
         x, y, z = (self.shoulder @ turn + self.reach_center).tolist()
         self.reach_center = (x, y, z)
-        low, high = np.quantile(self.hand[:, :2], [0.02, 0.98], axis=0)
-        spare = np.maximum(0.11 * self.reach - (high - low) / 2, 0.0)  # if it moves in one plane
-        box = [*(low - spare).tolist(), *(high + spare).tolist()]
-        suited = {kind: {"placements": [box], **self.defaults[kind]} for kind in self.near}
+        square = [x - self.reach, y - self.reach, x + self.reach, y + self.reach]
+        suited = {kind: {"placements": [square], **self.defaults[kind]} for kind in self.near}
         self.defaults = {**self.defaults, **suited}
 
     def bind(self, sim: Simulation) -> None:

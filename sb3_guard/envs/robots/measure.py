@@ -7,7 +7,7 @@ import numpy as np
 
 from sb3_guard.envs.types import Array
 
-SAMPLES = 1000  # random poses of an arm, from which its reach is measured
+SAMPLES = 2000  # random poses of an arm, from which its reach is measured
 
 
 def radius(model: mujoco.MjModel, data: mujoco.MjData, root: str) -> float:

@@ -7,6 +7,7 @@ and resets counters, seeds and environments when it continues; so its pieces are
 
 import copy
 import dataclasses
+import pickle
 import shlex
 import signal
 import sys
@@ -25,12 +26,20 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from gymnasium.wrappers import RecordVideo
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import (
+    VecEnv,
+    VecFrameStack,
+    VecMonitor,
+    VecNormalize,
+    VecVideoRecorder,
+)
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.algorithms.common.costs import time_limit
@@ -145,14 +154,16 @@ class Run:
         """
         The classes that ``env_wrapper`` or ``vec_env_wrapper`` names, and their arguments.
 
-        :param evaluation: without what ends episodes early, or changes rewards
+        :param evaluation: without what ends episodes early, changes rewards, or writes files
         """
         wrappers = []
         for cls, arguments in classes(kind, self.hyperparams.get(kind)):
             if evaluation:
-                for name in getattr(cls, "training_arguments", ()):
+                written = ["filename"] if issubclass(cls, (Monitor, VecMonitor)) else []
+                for name in (*written, *getattr(cls, "training_arguments", ())):
                     arguments.pop(name, None)
-            if not (evaluation and getattr(cls, "training_only", False)):
+            records = issubclass(cls, (RecordVideo, VecVideoRecorder))
+            if not (evaluation and (records or getattr(cls, "training_only", False))):
                 wrappers.append((cls, arguments))
         return wrappers
 
@@ -716,7 +727,8 @@ class Run:
             self.model.save(file)
         normalizer = normalizer_of(self.env)
         if normalizer is not None:
-            normalizer.save(str(folder.normalizer))
+            with replacing(folder.normalizer) as file:
+                pickle.dump(normalizer, file)
         final = self._play_final() if finished else {}
         result = {"algo": self.flags.algo, "env": self.flags.env, **result, "final": final}
         if self.delivery is not None:

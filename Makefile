@@ -51,7 +51,7 @@ bench: $(VENV)/ready
 	$(BIN)/python scripts/bench_engine.py
 	$(BIN)/python scripts/bench_training.py
 
-# Hashes of what environments and algorithms compute; ARGS="--match cpo" for some of them.
+# Hashes of what environments and algorithms compute; ARGS="cpo sac_lag" for some of them.
 fingerprint: $(VENV)/ready
 	@$(BIN)/python scripts/fingerprint.py $(ARGS)
 

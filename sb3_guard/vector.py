@@ -8,7 +8,7 @@ those that are nothing simpler, :class:`TensorVecEnv` that of simulators that st
 
 import pkgutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
@@ -17,8 +17,10 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import SyncVectorEnv, VectorEnv
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
@@ -141,6 +143,24 @@ def info_rows(infos: Mapping[str, Any], n: int) -> list[dict[str, Any]]:
     return rows
 
 
+@contextmanager
+def answered(env: VectorEnv) -> Iterator[None]:
+    """Ask an environment; if a process of an ``AsyncVectorEnv`` dies, end the others."""
+    try:
+        yield
+    except (Exception, KeyboardInterrupt) as error:
+        envs = env.unwrapped  # without a pipe to a process that has told of an error
+        gone = isinstance(error, EOFError | ConnectionError | KeyboardInterrupt)
+        if isinstance(envs, AsyncVectorEnv) and (gone or None in envs.parent_pipes):
+            for process in envs.processes:
+                process.terminate()
+            envs.closed = True  # its close() would wait for answers that do not come
+            if isinstance(error, Exception):
+                why = "because of an error printed above, by a signal or for lack of memory"
+                raise ConnectionError(f"a process of AsyncVectorEnv has died, {why}") from error
+        raise
+
+
 class BatchVecEnv(VecEnv):
     """N environments that step as one object, ``envs``, which has facts of all, but no rows."""
 
@@ -209,8 +229,10 @@ class GymnasiumVecEnv(BatchVecEnv):
         """Begin an episode in every row; the environment counts from the first row's seed.
 
         :raises ContractError: the space of a row is not that of a row
+        :raises ConnectionError: a process has died, as in any later step
         """
-        obs, infos = self.envs.reset(seed=self._seeds[0], options=self._options[0] or None)
+        with answered(self.envs):
+            obs, infos = self.envs.reset(seed=self._seeds[0], options=self._options[0] or None)
 
         def check(space: spaces.Space, values: Any) -> None:
             if np.shape(values) != (self.num_envs, *(space.shape or ())):
@@ -230,7 +252,8 @@ class GymnasiumVecEnv(BatchVecEnv):
         :raises ContractError: a row has ended without its last observation, its reset begins
             episodes of other rows, or ``cost`` does not return N numbers
         """
-        obs, rewards, terminated, truncated, infos = self.envs.step(self._actions)
+        with answered(self.envs):
+            obs, rewards, terminated, truncated, infos = self.envs.step(self._actions)
         dones, n = np.logical_or(terminated, truncated), self.num_envs
         rows, ended = info_rows(infos, n), np.flatnonzero(dones).tolist()
         # copies: the environment may write the next step into the same arrays
@@ -283,7 +306,8 @@ class GymnasiumVecEnv(BatchVecEnv):
             out[mask] = new
             return out
 
-        new, _ = self.envs.reset(options={"reset_mask": mask.copy()})
+        with answered(self.envs):
+            new, _ = self.envs.reset(options={"reset_mask": mask.copy()})
         self._obs = each(replaced, self._obs, new)
         return self._obs
 
@@ -294,10 +318,12 @@ class GymnasiumVecEnv(BatchVecEnv):
 class TensorVecEnv(BatchVecEnv):
     """A simulator that steps torch tensors of N rows, as mjlab and Isaac Lab do.
 
-    ``step`` returns observations by group, reward, terminated, truncated and ``extras``; rows that
-    have ended are new episodes already. All that Stable-Baselines3 needs of a step leaves the
-    device in one copy. The simulator does not tell the last observation of an episode: the one
-    before it stands in, where a time-out is bootstrapped.
+    ``step`` returns observations by group, reward, terminated, truncated and ``extras``, and begins
+    new episodes in rows that have ended; with ``cfg.auto_reset=False``, ``reset(env_ids=rows)``
+    does. All that Stable-Baselines3 needs of a step leaves the device in one copy, new episodes in
+    another. Last observations are those of a step without resets, or ``extras["final_obs"]``, N
+    rows by group; else the ones before them stand in. A row that is truncated and not terminated
+    has timed out, and any row that has ended of which ``extras["time_outs"]``, [N], is true.
 
     :param env: the simulator, with ``num_envs``, ``device``, ``max_episode_length`` and the spaces
         of a row
@@ -305,7 +331,7 @@ class TensorVecEnv(BatchVecEnv):
         next_obs, extras)`` of tensors that returns it; it becomes ``info["cost"]``
     :param group: which observations the agent sees; None for ``"policy"``, ``"actor"`` or the first
     :param clip_actions: actions are within ± that; the simulator's have no bounds
-    :raises TypeError: the environment steps no tensors
+    :raises TypeError: the environment steps no tensors, or a ``TimeLimit`` is around it
     :raises ValueError: there is no such group
     """
 
@@ -317,18 +343,23 @@ class TensorVecEnv(BatchVecEnv):
         clip_actions: float = 5.0,
     ) -> None:
         inner = getattr(env, "unwrapped", env)  # Gymnasium's wrappers pass no attributes on
+        name = type(inner).__name__
         if not hasattr(inner, "device"):
-            raise TypeError(f"{type(inner).__name__} has no device: algorithms take it as it is")
+            raise TypeError(f"{name} has no device: algorithms take it as it is")
+        if is_wrapped(env, TimeLimit):
+            raise TypeError(
+                f"a TimeLimit ends all rows at once: set the episode length of {name} itself, and "
+                "register it without max_episode_steps"
+            )
+        self.auto_reset = getattr(getattr(inner, "cfg", None), "auto_reset", True)
         self.device, groups = inner.device, inner.single_observation_space.spaces
-        first = next(name for name in ("policy", "actor", *groups) if name in groups)
+        first = next(key for key in ("policy", "actor", *groups) if key in groups)
         self.group = fit("group", group or first, choices=[*groups])
         self.cost = cost
         bound = np.full(inner.single_action_space.shape, clip_actions, np.float32)
         seen = spaces.Box(-np.inf, np.inf, groups[self.group].shape)
         super().__init__(env, inner.num_envs, seen, spaces.Box(-bound, bound))
-        self.spec = EnvSpec(
-            f"{type(inner).__name__}-v0", max_episode_steps=inner.max_episode_length
-        )
+        self.spec = EnvSpec(f"{name}-v0", max_episode_steps=inner.max_episode_length)
         self._tensor, self._obs = th.zeros(0), np.zeros(0)  # the same, on the device and here
 
     def reset(self) -> np.ndarray:
@@ -341,28 +372,50 @@ class TensorVecEnv(BatchVecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """
-        :raises ContractError: ``extras`` have no such cost, or it is not a number for each row
+        :raises ContractError: ``step`` does not return five values, or a cost, time-outs or last
+            observations are not of N rows
         """
         actions = th.as_tensor(self._actions, dtype=th.float32, device=self.device)
-        obs, reward, terminated, truncated, extras = self.envs.step(actions)
-        before, self._tensor = self._tensor, obs[self.group].clone()
-        if callable(self.cost):
-            cost = self.cost(before, actions, self._tensor, extras)
-        else:
-            cost = extras.get(self.cost)
+        step = self.envs.step(actions)
+        if len(step) != 5:
+            raise ContractError(
+                f"step returned {len(step)} values, not five (observations, reward, terminated, "
+                "truncated, extras): leave out the wrapper for another library"
+            )
+        obs, reward, terminated, truncated, extras = step
+        before, now = self._tensor, obs[self.group].clone()
+        final, last = extras.get("final_obs"), now
+        if final is not None:
+            last = final.get(self.group) if isinstance(final, Mapping) else final
+        late = extras.get("time_outs", th.zeros_like(reward))
+        for name, tensor, like in ("final_obs", last, now), ("time_outs", late, reward):
+            if getattr(tensor, "shape", None) != like.shape:
+                raise ContractError(f"extras[{name!r}] has no tensor of shape {tuple(like.shape)}")
+        if final is not None:
+            ended = (terminated + truncated > 0).reshape(-1, *[1] * (now.ndim - 1))
+            last = th.where(ended, last, now)
+        seen = before, actions, last, extras
+        cost = self.cost(*seen) if callable(self.cost) else extras.get(self.cost)
         if getattr(cost, "shape", None) != reward.shape:
             raise ContractError(
                 f"cost={self.cost!r} is no tensor of {len(reward)} numbers; extras: {[*extras]}"
             )
-        columns = th.stack([reward, terminated, truncated, cost], dim=1)
-        together = th.cat([columns, self._tensor.flatten(1)], dim=1).float().cpu().numpy()
-        rewards, died, late, costs = together[:, :4].T
-        infos: list[dict[str, Any]] = [
-            {"cost": cost, "TimeLimit.truncated": cut}
-            for cost, cut in zip(costs.tolist(), (late > died).tolist(), strict=True)
-        ]
-        dones = (died + late) > 0.0
-        for i in np.flatnonzero(dones).tolist():
-            infos[i]["terminal_observation"] = self._obs[i]
-        self._obs = together[:, 4:].reshape(self._obs.shape)
+        columns = th.stack([reward, terminated, truncated, late, cost], dim=1)
+        together = th.cat([columns, last.flatten(1)], dim=1).float().cpu().numpy()
+        rewards, died, cut, late, costs = together[:, :5].T
+        shown = together[:, 5:].reshape(self._obs.shape)
+        dones, cut = died + cut > 0.0, (late > 0.0) | (cut > died)
+        infos: list[dict[str, Any]] = [{"cost": cost} for cost in costs.tolist()]
+        rows, lost = np.flatnonzero(dones).tolist(), self.auto_reset and final is None
+        for i in rows:
+            infos[i]["TimeLimit.truncated"] = bool(cut[i])
+            infos[i]["terminal_observation"] = (self._obs if lost else shown)[i]
+        if rows and not lost:
+            ids = th.as_tensor(rows, device=self.device)
+            if not self.auto_reset:
+                new = self.envs.reset(env_ids=ids)[0][self.group]
+                now = now.index_copy(0, ids, new[ids])
+            shown = shown.copy()
+            shown[rows] = now[ids].float().cpu().numpy()
+        self._tensor, self._obs = now, shown
         return self._obs, rewards, dones, infos

@@ -13,6 +13,7 @@ hashes hold on one machine with one set of packages; one thread each.
 import argparse
 import hashlib
 import importlib
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -57,21 +58,20 @@ def algorithm(cls: Any) -> str:
 
 
 def main() -> None:
-    """Print a line for each suite and algorithm."""
+    """Print a line for each environment and algorithm."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("names", nargs="*", help="environments and algorithms; none: all")
     parser.add_argument("--only", choices=["suites", "algorithms"])
-    parser.add_argument("--match", default="", help="names that contain this text only")
     args = parser.parse_args()
     th.set_num_threads(1)
+    hashes = {}
     if args.only != "algorithms":
-        for env_id in sb3_guard.env_ids("guard"):
-            if args.match in env_id:
-                print(env_id, suite(env_id), flush=True)
+        hashes |= {env_id: partial(suite, env_id) for env_id in sb3_guard.env_ids("guard")}
     if args.only != "suites":
-        module = importlib.import_module("sb3_guard.algorithms")
-        for key in sorted(module.ALGORITHMS):
-            if args.match in key:
-                print(key, algorithm(module.ALGORITHMS[key]), flush=True)
+        algorithms = importlib.import_module("sb3_guard.algorithms").ALGORITHMS
+        hashes |= {key: partial(algorithm, algorithms[key]) for key in sorted(algorithms)}
+    for name in args.names or hashes:
+        print(name, hashes[name](), flush=True)
 
 
 if __name__ == "__main__":

@@ -13,8 +13,8 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_guard.algorithms.common.constrained import BROKEN_OFF
 from sb3_guard.common.evaluation import (
-    BROKEN_OFF,
     Evaluation,
     check_agent,
     evaluate_policy,

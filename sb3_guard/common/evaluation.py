@@ -18,7 +18,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
-from sb3_guard.algorithms.common.constrained import Constrained
+from sb3_guard.algorithms.common.constrained import BROKEN_OFF, Constrained
 from sb3_guard.checks import NumberError, check_cost_keys
 from sb3_guard.common.monitor import cost_keys_of, total_cost
 from sb3_guard.costs import EpisodeCost, EpisodeCosts, read_costs
@@ -33,10 +33,6 @@ from sb3_guard.vector import (
     step_limits,
 )
 
-BROKEN_OFF = (
-    "eval_env is the training environment, whose episodes every evaluation would break off: make "
-    "another one for it"
-)
 LONGEST = 20_000  # steps of an episode that nothing ends, after which it is given up
 
 
@@ -298,7 +294,7 @@ def evaluate_policy(
     if isinstance(model, Constrained) and model.env and share_environment(model.env, env):
         if model.collecting:
             raise ValueError(BROKEN_OFF)
-        model._last_obs = None  # so the next learn begins new episodes, as after set_env
+        model.set_env(model.env)  # so the next learn begins new episodes
 
     # steps after which an episode is given up
     longest = int(max([LONGEST, *step_limits(env)])) if max_steps is None else None

@@ -12,7 +12,7 @@ import functools
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -68,8 +68,9 @@ class Footprint:
     :param locations: fixed places, (x, y) m, for the first objects of the group
     :param margin: extra distance to every other object, m; of two margins the greater counts
     :param height: z, m, or a range to draw z from, after x and y
-    :param reach: greatest distance of (x, y, z) from the robot's base, m
-    :param base: where that is, (x, y) m
+    :param reach: greatest distance of (x, y, z) from ``reach_center``, m
+    :param reach_center: the point that the robot's reach is measured from, (x, y, z) m
+    :param hand: places of the robot's hand, [n, 3] m: a centre is within reach / 15 of one
     :param mover: whether it moves by itself, so that a new goal may ignore it in need
     :param redrawn: whether the first object is drawn again within an episode
     :param last: whether it is also drawn again once everything else has its place
@@ -86,8 +87,9 @@ class Footprint:
     margin: float = 0.0
     height: float | tuple[float, float] = 0.0
     reach: float = math.inf
+    reach_center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    hand: Array | None = field(default=None, compare=False)
     mover: bool = False
-    base: tuple[float, float] = (0.0, 0.0)
     redrawn: bool = False
     last: bool = False
     among: tuple[tuple[float, float], ...] = ()
@@ -111,14 +113,16 @@ class Footprint:
                 f"{self.name}: {len(self.locations)} locations for {self.num} objects; "
                 "give at most one each"
             )
-        low = self._lowest
-        for place in self.locations or self.among or (self.base,):
-            gap = math.hypot(math.dist(place, self.base), low)
+        *center, z = self.reach_center
+        best = float(np.clip(z, *self._range))
+        for place in self.locations or self.among or (center,):
+            gap = math.dist((*place, best), self.reach_center)
             if gap > self.reach:
                 where = f"location {place}" if self.locations or self.among else "height"
                 raise ValueError(
-                    f"{self.name}: {where} is out of the robot's reach: {gap:.2f} m from its base "
-                    f"at {self.base} even at the lowest height, {low} m; it reaches {self.reach} m"
+                    f"{self.name}: {where} is out of the robot's reach: {gap:.2f} m from "
+                    f"{self.reach_center} even at the best height, {best} m; it reaches "
+                    f"{self.reach} m"
                 )
 
     @functools.cached_property
@@ -144,24 +148,40 @@ class Footprint:
 
     def elevate(self, rng: np.random.Generator, xy: Array) -> Array:
         """Heights for centres [n, 2]: [n] m, within reach."""
+        low, high = (np.full(len(xy), z) for z in self._range)
         if not isinstance(self.height, tuple):
-            return np.full(len(xy), self.height)
-        high: float | Array
-        low, high = self.height
+            return low
         if math.isfinite(self.reach):
-            dx, dy = xy[:, 0] - self.base[0], xy[:, 1] - self.base[1]
+            x, y, z = self.reach_center
+            dx, dy = xy[:, 0] - x, xy[:, 1] - y
             room = np.sqrt(np.maximum(self.reach**2 - dx**2 - dy**2, 0.0))
-            high = np.maximum(np.minimum(high, room), low)
-        return low + rng.random(len(xy)) * (high - low)
+            low = np.maximum(low, z - room)
+            high = np.maximum(np.minimum(high, z + room), low)
+        if self.hand is None:
+            return low + rng.random(len(xy)) * (high - low)
+        gaps = self._gaps(self.hand, xy.T)  # a place near by, drawn, or the nearest
+        ranks = np.where(gaps < (self.reach / 15) ** 2, -rng.random(gaps.shape), gaps)
+        return np.clip(self.hand[ranks.argmin(axis=1), 2], low, high)
 
     @property
-    def _lowest(self) -> float:
-        return self.height[0] if isinstance(self.height, tuple) else self.height
+    def _range(self) -> tuple[float, float]:
+        return self.height if isinstance(self.height, tuple) else (self.height, self.height)
+
+    def _gaps(self, hand: Array, xy: Array) -> Array:
+        """Squared distances of centres [2, ...] at their best heights to the hand, [..., n] m²."""
+        x, y, z = hand.T
+        gaps: Array = (xy[0][..., None] - x) ** 2 + (xy[1][..., None] - y) ** 2
+        gaps += (z - np.clip(z, *self._range)) ** 2
+        return gaps
 
     def out_of_reach(self, draws: Array) -> Array:
-        """Which centres, [2, n] m, leave no height within reach, [n] bool."""
-        dx, dy = draws[0] - self.base[0], draws[1] - self.base[1]
-        return dx**2 + dy**2 > self.reach**2 - self._lowest**2
+        """Which centres, [2, ...] m, leave no height within reach, [...] bool."""
+        x, y, z = self.reach_center
+        dx, dy = draws[0] - x, draws[1] - y
+        far: Array = dx**2 + dy**2 > self.reach**2 - (np.clip(z, *self._range) - z) ** 2
+        if self.hand is not None and not self.among:
+            far |= self._gaps(self.hand, draws).min(axis=-1) > (self.reach / 15) ** 2
+        return far
 
 
 @functools.lru_cache
@@ -254,7 +274,7 @@ def _centres(
 
 def _no_room(f: Footprint) -> LayoutError:
     """What to raise where a part found no room most often."""
-    within = f" within {f.reach} m of the robot's base" if math.isfinite(f.reach) else ""
+    within = f" within {f.reach} m of {f.reach_center}" if math.isfinite(f.reach) else ""
     return LayoutError(
         f"{f.name} cannot be placed: {f.num} with keepout {f.keepout} m find no room in "
         f"{list(f.placements)}{within} in addition to the other parts: reduce num or keepout, its "

@@ -300,10 +300,12 @@ class Robot(Part):
     # sensors are those of the last physics step's beginning, as mj_step leaves them
     stage: ClassVar[mujoco.mjtStage] = mujoco.mjtStage.mjSTAGE_ACC
     root: ClassVar[str]  # name of the outermost body in the compiled world
-    reach: ClassVar[float] = math.inf  # m from its base: where goals and hazards make sense
+    reach: ClassVar[float] = math.inf  # m from reach_center: where goals and hazards make sense
+    reach_center: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m
+    hand: Array | None = None  # places of an arm's end effector, [n, 3] m; None: all within reach
     # parameters of tasks, constraints and the arena that suit its size, by keyword; a scenario's
     # come first
-    defaults: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
+    defaults: Mapping[str, Mapping[str, Any]] = {}
     altitude: float = 0.0  # m, z of its position when an episode begins
     action_size: int
     action_range: tuple[Array | float, Array | float] = (-1.0, 1.0)  # lowest and highest actions
@@ -323,10 +325,10 @@ class Robot(Part):
         """Its bodies in a compiled world: the outermost and all that hangs on it."""
         return below(model, [self.root])
 
-    @property
-    def base(self) -> tuple[float, float]:
-        """What ``reach`` is measured from, (x, y) m."""
-        return (0.0, 0.0)
+    def within(self, planar: bool) -> dict[str, Any]:
+        """Where things can be reached, as arguments of a footprint, by (x, y) alone if planar."""
+        x, y, z = self.reach_center
+        return {"reach": self.reach, "reach_center": (x, y, 0.0 if planar else z)}
 
     @property
     def position(self) -> Array:

@@ -1,6 +1,5 @@
 """Parts with like objects that are placed when an episode begins."""
 
-import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -77,8 +76,7 @@ class Placed(Part):
             self.locations,
             self.margin,
             height=0.0 if self.planar else self.height,
-            reach=robot.reach if self.reachable else math.inf,
-            base=robot.base,
+            **(robot.within(self.planar) if self.reachable else {}),
             mover=self.moves,
             cover=cover,
             label=f"{self.name}.keepout",

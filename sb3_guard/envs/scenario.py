@@ -18,6 +18,7 @@ from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.extras import Extras
 from sb3_guard.envs.layout import Layout
 from sb3_guard.envs.observation import Lidar
+from sb3_guard.envs.part import Robot
 from sb3_guard.envs.registry import CONSTRAINTS, KEYWORDS, OPTIONS, ROBOTS, TASKS
 from sb3_guard.fields import plain
 from sb3_guard.ids import UnknownPart
@@ -195,6 +196,7 @@ class Scenario:
 
         :raises ValueError: an unknown name, a bad value, or a constraint's name that cannot be used
         """
+        robot = ROBOTS[self.robot].from_params(self.robot_params, "robot")
         by_name = {name.lower(): cls for name, cls in CONSTRAINTS.items()}
         taken = (self.task.lower(), *KEYWORDS)
         constraints = []
@@ -219,28 +221,29 @@ class Scenario:
                 raise ValueError(
                     f"constraint {name!r} cannot be of type {kind!r}: {name!r} is a type itself"
                 )
-            constraints.append(by_name[kind].from_params(self._suited(kind, params), name))
+            constraints.append(by_name[kind].from_params(_suited(robot, kind, params), name))
         task = self.task.lower()
         return {
-            "robot": ROBOTS[self.robot].from_params(self.robot_params, "robot"),
-            "task": TASKS[self.task].from_params(self._suited(task, self.task_params), task),
+            "robot": robot,
+            "task": TASKS[self.task].from_params(_suited(robot, task, self.task_params), task),
             "constraints": constraints,
             "lidar": Lidar.from_params(self.lidar),
             "layout": Layout.from_params(self.layout),
             "extras": Extras.from_params(self.observe),
-            "arena": Arena.from_params(self._suited("arena", self.arena)),
+            "arena": Arena.from_params(_suited(robot, "arena", self.arena)),
             "cost": self.cost,
         }
-
-    def _suited(self, kind: str, params: Params) -> Params:
-        """Parameters of a part, and those that the robot's size suggests where none is stated."""
-        defaults = ROBOTS[self.robot].defaults.get(kind)
-        if not defaults or not isinstance(params, Mapping):
-            return params
-        planar = params.get("space") == "planar"  # where there is no height
-        usual = {key: v for key, v in defaults.items() if not (planar and key == "height")}
-        return {**usual, **params}
 
     def build(self, num_envs: int = 1, num_threads: int | None = None) -> Engine:
         """Run ``num_envs`` simulations of this scenario."""
         return Engine(**self.parts(), num_envs=num_envs, num_threads=num_threads)
+
+
+def _suited(robot: Robot, kind: str, params: Params) -> Params:
+    """Parameters of a part, and those that suit the robot where none is stated."""
+    defaults = robot.defaults.get(kind)
+    if not defaults or not isinstance(params, Mapping):
+        return params
+    planar = params.get("space") == "planar"  # where there is no height
+    usual = {key: v for key, v in defaults.items() if not (planar and key == "height")}
+    return {**usual, **params}

@@ -80,7 +80,7 @@ def test_time_outs_bootstrap_costs_on_a_copy(terminate: bool) -> None:
     env = make_vec_env(lambda: CostPoint(episode_length=7, terminate=terminate), 2, seed=0)
     arguments = {"n_steps": 16, "n_critic_updates": 1, "cost_gamma": 0.8, "seed": 0}
     model = CPO("MlpPolicy", env, cost_limit=0.0, cost_gae_lambda=0.97, **arguments)
-    model.cost_units = np.ones(1, np.float32)  # as after a cost
+    model.cost_units = np.full(1, 3.0, np.float32)  # as after a cost
     terminals: list[tuple[int, np.ndarray]] = []
 
     def record(local: dict, _: dict) -> bool:
@@ -100,11 +100,13 @@ def test_time_outs_bootstrap_costs_on_a_copy(terminate: bool) -> None:
         before["costs"] = buffer.costs[:, 0, 0].copy()
         before["advantages"] = buffer.cost_advantages[:, 0, 0].copy()
         before["returns"] = buffer.cost_returns[:, 0, 0].copy()
-        before["values"] = buffer.cost_values[:, 0, 0].copy()
-        observations = th.as_tensor(np.stack([o for _, o in terminals]))
-        before["terminal"] = model.cost_critic.predict(observations)[:, 0].numpy()
-        last = th.as_tensor(model._last_obs)
-        before["last"] = model.cost_critic.predict(last)[0, 0].item()
+        for name, observations in (
+            ("values", buffer.observations[:, 0]),
+            ("terminal", np.stack([o for _, o in terminals])),
+            ("last", model._last_obs),
+        ):
+            predicted = model.cost_critic.predict(th.as_tensor(observations))
+            before[name] = 3.0 * predicted[:, 0].numpy()
         train()
 
     model.train = spy  # type: ignore[method-assign]
@@ -116,10 +118,10 @@ def test_time_outs_bootstrap_costs_on_a_copy(terminate: bool) -> None:
         expected[steps] = 0.8 * before["terminal"]
     np.testing.assert_allclose(before["bootstraps"], expected, rtol=1e-5)
     # The whole recursion once more, step by step.
-    advantage, paid = 0.0, before["last"]
+    advantage, paid = 0.0, before["last"][0]
     for t in reversed(range(16)):
         ends = t in steps
-        following = 0.0 if ends else (before["last"] if t == 15 else before["values"][t + 1])
+        following = 0.0 if ends else (before["last"][0] if t == 15 else before["values"][t + 1])
         paid = before["costs"][t] + expected[t] + 0.8 * (0.0 if ends else paid)
         assert before["returns"][t] == pytest.approx(paid, rel=1e-4, abs=1e-6)
         cost = before["costs"][t] + expected[t]

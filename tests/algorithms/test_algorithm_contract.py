@@ -172,6 +172,14 @@ def test_layers_of_the_cost_critic(cls: type[Any], critic: str) -> None:
     assert 17 in widths(model.cost_critic)
 
 
+@pytest.mark.parametrize("cls", [*PAIR, TRPOSL])
+def test_networks_of_costs_follow_the_schedule_of_the_learning_rate(cls: Any) -> None:
+    model = small(cls, points(), learning_rate=lambda remaining: 1e-4 + 1e-3 * remaining).learn(160)
+    owner = model.policy.action_filter if cls is TRPOSL else model.cost_critic
+    rate = model.lr_schedule(model._current_progress_remaining)
+    assert owner.optimizer.param_groups[0]["lr"] == rate < 1e-3
+
+
 # Environments
 
 

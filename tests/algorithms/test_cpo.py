@@ -11,7 +11,7 @@ import torch as th
 from cost_envs import CostPoint, told
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.vec_env import SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_guard.algorithms import CPO
 from sb3_guard.algorithms.common.actor import Trial
@@ -91,10 +91,15 @@ def test_line_search_test_of_two_costs(
     assert accept(Trial(0.01, 0.0, np.array(cost_change))) is accepted
 
 
-@pytest.mark.parametrize("limit", [0.0, 3.0])
-def test_the_step_solves_the_linearised_problem(limit: float) -> None:
-    """Within the region, and within the limit wherever the region reaches it."""
-    model = make(cost_limit=limit, cg_max_steps=60)
+@pytest.mark.parametrize(
+    ("limit", "margin", "cases"),
+    [(3.0, 0.0, {Case.LOST, Case.RECOVERABLE}), (10.0, 1.0, {Case.INACTIVE, Case.BINDING})],
+)
+def test_the_step_solves_the_linearised_problem(limit: float, margin: float, cases: Any) -> None:
+    """Within limit and margin where the region reaches them, else 98 % of the way to them."""
+    near = {"hazard": (-1.0, 0.0)}
+    model = make(lambda: CostPoint(**near), cost_limit=limit, cg_max_steps=60, margin_lr=0.0)
+    model.margin.value += margin
     seen = []
     plan = model.plan
 
@@ -102,17 +107,22 @@ def test_the_step_solves_the_linearised_problem(limit: float) -> None:
         x, accept = plan(region)
         reach = float(region.product(x) @ x) / (2 * region.delta)
         case = Case(model.logger.name_to_value["train/cpo_case"])
-        c = model.margin.violation(model.costs)
-        seen.append((case, c + (region.cost_gradients @ x).numpy(), reach))
+        c = float(model.costs.episode_cost[0] - limit + margin) / model.costs.horizon
+        b = region.cost_gradients[0]
+        most = float(2 * region.delta * (b @ region.solve(b))) ** 0.5
+        seen.append((case, c, most, float(b @ x), reach))
         return x, accept
 
     model.plan = spy  # type: ignore[method-assign]
     model.learn(1200)
     assert len(seen) == 3
-    for case, residual, reach in seen:
+    assert {case for case, *_ in seen} == cases
+    for case, c, most, change, reach in seen:
         assert reach <= 1.01
-        if case is not Case.LOST:
-            assert residual[0] <= 1e-4
+        if case is Case.LOST:
+            assert c > most and change == pytest.approx(-0.98 * most, rel=1e-4)
+        else:
+            assert c + change <= 1e-6
 
 
 def test_violation_is_in_units_of_the_cost_surrogate() -> None:
@@ -176,14 +186,11 @@ def test_every_episode_counts_once_whatever_its_length(
 
 
 @pytest.mark.parametrize("subprocess", [False, True])
-def test_before_any_episode_ends_the_stated_length_counts(subprocess: bool) -> None:
+def test_before_any_episode_ends_the_mean_of_stated_lengths_counts(subprocess: bool) -> None:
     """Of an environment registered by a function, whose spec can't leave its process, as well."""
-    spec = gym.envs.registration.EnvSpec(
-        "CostPoint-v0", lambda: CostPoint(10**6, hazard=(-1, 0)), max_episode_steps=500
-    )
-    kind: Any = SubprocVecEnv if subprocess else None
-    how = {"start_method": "fork"} if subprocess else {}
-    env = make_vec_env(lambda: gym.make(spec), 2, seed=0, vec_env_cls=kind, vec_env_kwargs=how)
+    spec = gym.envs.registration.EnvSpec("CostPoint-v0", lambda: CostPoint(10**6, hazard=(-1, 0)))
+    makers = [lambda n=n: gym.make(spec, max_episode_steps=n) for n in (400, 600)]
+    env = SubprocVecEnv(makers, start_method="fork") if subprocess else DummyVecEnv(makers)
     model = CPO("MlpPolicy", env, n_steps=200, cost_limit=0.5, n_critic_updates=1, seed=0)
     rates = []
     train = model.train

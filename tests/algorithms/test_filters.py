@@ -437,6 +437,15 @@ def test_a_threshold_given_to_load_holds_at_once(cls: Any, tmp_path: Path) -> No
     assert np.abs(actions[1] - actions[0]).max() > 0.01
 
 
+def test_the_tolerance_is_in_root_mean_square_errors_of_the_model() -> None:
+    model = make(TRPOSL, tolerance=2.0).learn(80)
+    batch, layer = model._batch(), model.policy.action_filter
+    last = batch.previous_costs / layer.unit
+    found = layer.predicted((batch.observations, model._executed(batch), last))[:, :1]
+    error = (layer.unit * found - batch.costs).square().mean().sqrt()
+    assert layer.noise.item() == pytest.approx(2.0 * error.item(), rel=1e-5)
+
+
 def test_without_a_cost_the_cost_model_rests() -> None:
     model = make(TRPOSL, points(2, cost_scale=0.0)).learn(160)
     assert not model.policy.action_filter.optimizer.state

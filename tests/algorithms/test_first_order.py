@@ -176,6 +176,9 @@ def test_the_weight_of_a_cost_does_not_know_the_unit_of_reward(cls: Any) -> None
             weight = model._unit if cls is P3O else model._weight / model.multiplier.value
             expected = buffer.advantages.std() / buffer.cost_advantages.std()
             assert float(weight) == pytest.approx(expected, rel=1e-4)
+        if cls is P3O:
+            violation = expected * model.costs.violation
+            assert model._violation.numpy() == pytest.approx(violation, rel=1e-4)
     th.testing.assert_close(100.0 * gradients[0], gradients[1], rtol=1e-3, atol=1e-5)
 
 
@@ -269,6 +272,10 @@ def test_crpo_lowers_the_cost_that_is_most_above_its_limit(costs: Any, worst: An
     rows = batch([1.0, 2.0], [[3.0, 5.0], [4.0, 6.0]])
     expected = [1.0, 2.0] if worst is None else [[-3.0, -4.0], [-5.0, -6.0]][worst]
     assert model.advantages(rows).tolist() == expected
+    model.cost_limit = [2.0, 0.0]  # of which any cost is one unit
+    for cost, worst in ((4.0, 1), (5.0, 0)):
+        told(model, [cost, 9.0], 30.0)
+        assert model.violated == worst
 
 
 def test_rcpo_takes_the_whole_step() -> None:
@@ -301,6 +308,8 @@ def test_cups_second_step_is_stopped_by_its_own_distance() -> None:
     logged = model.logger.name_to_value
     assert logged["train/projection_kl"] < model.target_kl < logged["train/approx_kl"]
     assert logged["train/n_updates"] == model._n_updates == 5
+    moving: dict[str, Any] = {**still, "lambda_init": 1.0, "projection_reach": 1e-9}
+    assert make(CUP, target_kl=1.0, n_epochs=4, **moving).learn(128)._n_updates == 4 + 1
 
 
 # Bad input

@@ -111,6 +111,11 @@ def test_every_update_has_the_limit_of_its_time(cls: Any, limit: Any, tmp_path: 
     assert evaluate_policy(again, env, n_eval_episodes=1).limits == (2.0,)
 
 
+def test_a_rollout_beyond_the_end_of_the_training_has_the_last_limit() -> None:
+    model = CPO("MlpPolicy", points(), cost_limit="lin_4_2", n_steps=40).learn(100)
+    assert model.num_timesteps == 160 and model.costs.limits.tolist() == [2.0]
+
+
 def test_an_agent_is_judged_by_the_last_limit(tmp_path: Path) -> None:
     model = CPO("MlpPolicy", points(), cost_limit="lin_4_2")
     callback = CostEvalCallback(points(), n_eval_episodes=1)
@@ -157,5 +162,8 @@ def test_updates_keep_to_the_aim(cls: Any, tmp_path: Path) -> None:
     assert len(episodes) > 10 and 0 < episodes.std()
     aim = 9.0 - min(2.22 * episodes.std(ddof=1) / 20, 4.5)
     assert model.costs.limits == pytest.approx(aim) and model.final_cost_limits == 9.0
+    if cls is not SACLag:  # which has written it down
+        excess = model.logger.name_to_value["train/constraint_violation"]
+        assert excess == pytest.approx(model.costs.episode_cost[0] - 9.0)
     row = json.loads((tmp_path / "progress.json").read_text().splitlines()[-1])
     assert 4.5 <= row["train/cost_aim"] < 9.0 and row["rollout/cost_limit"] == 9.0

@@ -96,8 +96,41 @@ def test_while_the_limit_holds_it_is_sb3s_bit_for_bit(ours: Any, theirs: Any, mo
             logged[f"train/{name}"], rel=1e-6
         ), name
     assert model.logger.name_to_value["train/cost_critic_loss"] > 0.0
-    # A limit that is broken makes another run of it.
-    assert state_of(ours("MlpPolicy", VecNormalize(points()), **kwargs()).learn(200)) != state
+
+
+@every
+def test_the_actor_descends_the_lagrangian(cls: Any) -> None:
+    """Its loss and gradient by hand, (α log π - Q + Σ w_i Q_Ci) / (1 + Σ λ_i); α is 0 in TD3.
+
+    w_i is λ_i in standard deviations of Q over those of Q_Ci, of the batch's own actions.
+    """
+    more = settings() | {"cost_keys": ("cost", "again"), "missing_cost": "zero", "cost_limit": 1.0}
+    more |= {} if cls is TD3Lag else {"ent_coef": 0.1}
+    model = cls("MlpPolicy", points(), **more).learn(80)
+    for part in (model.actor, model.critic, model.cost_critic):
+        part.optimizer.param_groups[0]["lr"] = 0.0
+    model.prices, model._n_updates = np.array([0.5, 2.0]), 2  # an update of TD3's actor, too
+    batch, moved = model.replay_buffer.sample(8), [*model.actor.parameters()]
+    th.manual_seed(1)
+    loss = model.learn_from(batch, 0)["actor_loss"]
+    gradient = [part.grad.clone() for part in moved]
+
+    th.manual_seed(1)
+    at, entropy = batch.observations, 0.0
+    if cls is TD3Lag:
+        actions = model.actor(at)
+        value = model.critic.q1_forward(at, actions)[:, 0]
+    else:
+        actions, log_prob = model.actor.action_log_prob(at)
+        values, entropy = model.critic(at, actions), 0.1 * log_prob
+        value = values.mean((1, 2)) if cls is TQCLag else th.min(*values)[:, 0]
+    replayed = model.critic(at, batch.actions)
+    replayed = replayed.mean((1, 2)) if cls is TQCLag else replayed[0]
+    spread = model.cost_critic(at, batch.actions).std(0, correction=0)
+    weight = (th.tensor([0.5, 2.0]) * replayed.std(correction=0) / spread).detach()
+    expected = ((entropy - value + model.cost_critic(at, actions) @ weight) / 3.5).mean()
+    assert loss == pytest.approx(expected.item(), rel=1e-5)
+    th.testing.assert_close(gradient, [*th.autograd.grad(expected, moved)])
 
 
 @shared
@@ -147,8 +180,8 @@ class Clock(gymnasium.Env[Any, Any]):
 def test_what_is_replayed_and_learnt_from(cls: Any, cut: bool) -> None:
     """Each row has the cost of its own step, the last one's too, and what came after it."""
     env = make_vec_env(lambda: Clock(4, cut), 3)
-    model = cls("MlpPolicy", env, cost_keys=("cost", "ten"), cost_limit=[10.0, 1.0], **settings())
-    model.learn(90)
+    more = {"cost_keys": ("cost", "ten"), "cost_limit": [10.0, 1.0], "cost_gamma": 0.8}
+    model = cls("MlpPolicy", env, **more, **settings()).learn(90)
     batch = model.replay_buffer.sample(256)
     times = batch.observations[:, 0]
     th.testing.assert_close(batch.costs, th.stack([times, 10.0 * times], dim=1))
@@ -170,7 +203,7 @@ def test_what_is_replayed_and_learnt_from(cls: Any, cut: bool) -> None:
     with th.no_grad():
         after = critic.target(batch.next_observations, actions)[:, :, 0]
         largest = th.stack([after[:, :2].max(1)[0], after[:, 2:].max(1)[0]], dim=1)
-        target = batch.costs + 0.99 * (1.0 - ends.float()[:, None]) * largest
+        target = batch.costs + 0.8 * (1.0 - ends.float()[:, None]) * largest
         values = critic.online(batch.observations, batch.actions)[:, :, 0]
         expected = float(((values - target.repeat_interleave(2, dim=1)) ** 2).mean())
     assert model.fit_cost_critic(batch, actions) == pytest.approx(expected, rel=1e-5)
@@ -282,17 +315,6 @@ def test_networks_side_by_side_are_networks() -> None:
         th.testing.assert_close(together[:, k], x)
 
 
-def test_the_weight_of_a_cost_by_hand() -> None:
-    model = SACLag("MlpPolicy", points(), lambda_init=2.0, **settings()).learn(120)
-    model.prices = np.array([0.5])
-    batch, values = model.replay_buffer.sample(8), th.arange(8.0).reshape(8, 1)
-    model.cost_critic.optimizer.param_groups[0]["lr"] = 0.0
-    model.fit_cost_critic(batch, batch.actions)  # which keeps the deviation of this batch
-    with th.no_grad():
-        spread = values.std(correction=0) / model.cost_critic(*batch[:2]).std(0, correction=0)
-    th.testing.assert_close(model.batch_weights(values), 0.5 * spread)
-
-
 @shared
 def test_multipliers_follow_ended_episodes_once_and_not_before_their_time(cls: Any) -> None:
     """Episodes of 30 steps: λ moves at their ends alone, by η T / t, once ``lambda_starts``."""
@@ -363,9 +385,11 @@ def test_a_training_moves_multipliers_as_far_however_many_episodes_it_has(
 
 
 def paid(size: float) -> Any:
-    """Two environments that pay ``size`` and its negative by turns."""
+    """Two environments with two action dimensions that pay ``size`` and its negative by turns."""
 
     class Paid(Clock):
+        action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+
         def step(self, action: Any) -> Any:
             observation, _, *others = super().step(action)
             return observation, size * (-1.0) ** self.t, *others
@@ -376,7 +400,7 @@ def paid(size: float) -> Any:
 @pytest.mark.parametrize(
     ("ent_coef", "size", "start"),
     [
-        ("auto_reward", 0.02, 0.02),
+        ("auto_reward", 0.02, 0.01),
         ("auto_reward", 0.0, 1.0),  # nothing to go by
         ("auto", 0.02, 1.0),
         ("auto_0.1", 0.02, 0.1),
@@ -385,7 +409,7 @@ def paid(size: float) -> Any:
 def test_the_entropy_coefficient_starts_where_it_is_told(
     ent_coef: str, size: float, start: float
 ) -> None:
-    """One action dimension, so that the mean absolute reward is the start; once, not at each."""
+    """At the mean absolute reward by the number of action dimensions; once, not at each."""
     model = SACLag("MlpPolicy", paid(size), ent_coef=ent_coef, cost_limit=1e6, **settings())
     model.learn(62)
     assert model._n_updates == 1
@@ -395,6 +419,13 @@ def test_the_entropy_coefficient_starts_where_it_is_told(
     model.set_env(paid(1000.0))
     model.learn(4, reset_num_timesteps=False)
     assert float(model.log_ent_coef.exp()) == pytest.approx(start, rel=0.01)
+
+
+def test_the_entropy_coefficient_starts_at_the_rewards_that_are_learnt_from() -> None:
+    env = VecNormalize(paid(20.0), gamma=0.0)
+    model = SACLag("MlpPolicy", env, cost_limit=1e6, **settings()).learn(62)
+    start = env.normalize_reward(np.array(20.0)) / 2
+    assert float(model.log_ent_coef.exp()) == pytest.approx(float(start), rel=1e-3)
 
 
 @shared

@@ -101,7 +101,11 @@ def test_only_all_of_the_episodes_certify(limit, verdict, episodes):
     cost = certificate.costs["cost"]
     assert cost.lower < cost.mean < cost.upper and certificate.mean_return == 2.0
     assert str(certificate).startswith(f"{verdict}: mean cost ") and "\n" not in str(certificate)
-    assert (certificate.to_decide is not None) == (verdict == "undecided")
+    if verdict == "undecided":  # bounds come closer as 1/√n
+        shrunk = (cost.upper - cost.mean) / (cost.limit - cost.mean)
+        assert certificate.to_decide == pytest.approx(MOST * shrunk**2, rel=0.2)
+    else:
+        assert certificate.to_decide is None
     assert certificate.agent == ""  # there are no weights
     text = certificate.to_json()
     assert json.loads(text)["verdict"] == verdict
@@ -177,7 +181,7 @@ def test_an_error_is_a_small_probability(wrong):
         certify(Idle(), Lottery(), 3.0, **wrong)
 
 
-def test_fewer_than_fifty_episodes_are_refused():
+def test_fewer_than_a_hundred_episodes_are_refused():
     with pytest.raises(ValueError, match=r"n_episodes.*100"):
         certify(Idle(), Lottery(), 1.0, n_episodes=99)
 
@@ -190,8 +194,9 @@ def test_absent_costs_are_refused():
 
 
 def test_costs_that_may_be_absent_are_0_of_a_safe_agent():
-    model = CPO("MlpPolicy", Lottery(), cost_limit=1.0, missing_cost="zero", n_steps=8)
-    assert certify(model, Lottery(keys=("price",)), seed=1).costs["cost"].upper == 0.0
+    model = CPO("MlpPolicy", Lottery(), cost_limit=0.0, missing_cost="zero", n_steps=8)
+    bound = certify(model, Lottery(keys=("price",)), seed=1).costs["cost"]
+    assert (bound.upper, bound.share_above) == (0.0, 0.0)
 
 
 def test_a_limit_on_the_worst_step_says_so():

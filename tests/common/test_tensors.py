@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -22,11 +23,16 @@ class Simulator:
     """Row i counts to 3 + i and dies, or to 6 and is cut; it shows its count and its episode.
 
     As mjlab, it resets rows by itself and then shows the new episode; always in the same tensor.
+
+    :param auto_reset: False: it leaves resets to ``reset(env_ids=...)``, as mjlab may
+    :param tells_last: ``extras["final_obs"]`` has what was before the resets, as in Isaac Lab
     """
 
     num_envs, device, max_episode_length, render_mode = N, "cpu", 6, None
 
-    def __init__(self) -> None:
+    def __init__(self, auto_reset: bool = True, tells_last: bool = False) -> None:
+        self.cfg = SimpleNamespace(auto_reset=auto_reset)
+        self.tells_last = tells_last
         groups = {"actor": box(2), "critic": box(5)}
         self.single_observation_space = SimpleNamespace(spaces=groups)
         self.single_action_space = box(1)
@@ -39,10 +45,13 @@ class Simulator:
     def _observed(self) -> dict[str, th.Tensor]:
         return {"critic": th.zeros(N, 5), "actor": self.shown}
 
-    def reset(self, *, seed: Any = None) -> Any:
-        self.seed = seed
-        self.count[:] = 0.0
-        self.begun[:] = 1.0
+    def reset(self, *, seed: Any = None, env_ids: Any = None) -> Any:
+        if env_ids is None:
+            self.seed = seed
+            self.begun[:] = 0.0
+        rows = slice(None) if env_ids is None else env_ids
+        self.count[rows] = 0.0
+        self.begun[rows] += 1.0
         return self._observed(), self.extras
 
     def step(self, action: th.Tensor) -> Any:
@@ -52,8 +61,10 @@ class Simulator:
         died = self.count >= th.arange(N) + self.lives
         reward = self.count * 10.0
         self.extras["cost"] = (self.count > 2.0).float()
-        self.count[died | late] = 0.0
-        self.begun[died | late] += 1.0
+        if self.tells_last:
+            self.extras["final_obs"] = {"actor": self.shown.clone()}
+        if self.cfg.auto_reset:
+            self.reset(env_ids=died | late)
         return self._observed(), reward, died, late, self.extras
 
 
@@ -69,7 +80,7 @@ def test_a_step_is_what_stable_baselines3_needs():
     np.testing.assert_array_equal(obs, [[0, 2], [3, 1], [3, 1], [3, 1]])
     assert rewards.tolist() == [30.0] * N and dones.tolist() == [True, False, False, False]
     assert [info["cost"] for info in infos] == [1.0] * N
-    assert infos[0]["TimeLimit.truncated"] is False
+    assert infos[0]["TimeLimit.truncated"] is False and [*infos[1]] == ["cost"]
     np.testing.assert_array_equal(infos[0]["terminal_observation"], [2, 1])
     np.testing.assert_array_equal(steps[1][0][0], [2, 1])  # as it was: nothing wrote into it
 
@@ -95,8 +106,43 @@ def test_time_outs_are_apart_from_deaths():
     # row 3 dies and is cut in the same step
     assert cuts == {(3, 0): False, (4, 1): False, (5, 2): False, (6, 0): False, (6, 3): False}
     env.envs.lives = 9.0
-    cut = [env.step(np.zeros((N, 1)))[3][0]["TimeLimit.truncated"] for _ in range(6)]
-    assert cut == [False] * 5 + [True]
+    cut = [env.step(np.zeros((N, 1)))[3][0].get("TimeLimit.truncated") for _ in range(6)]
+    assert cut == [None] * 5 + [True]
+
+
+@pytest.mark.parametrize("how", [{"auto_reset": False}, {"tells_last": True}])
+def test_the_last_observation_is_that_of_the_simulator(how):
+    """Also in what the cost is computed from."""
+    env = TensorVecEnv(Simulator(**how), cost=lambda obs, a, after, extras: after[:, 0] - obs[:, 0])
+    env.reset()
+    for step in range(1, 9):
+        obs, _, dones, infos = env.step(np.zeros((N, 1)))
+        assert [info["cost"] for info in infos] == [1.0] * N
+        for i in np.flatnonzero(dones).tolist():
+            np.testing.assert_array_equal(
+                infos[i].pop("terminal_observation"), [3 + i, 1 + step // (4 + i)]
+            )
+            np.testing.assert_array_equal(obs[i], [0, 2 + step // (4 + i)])
+    np.testing.assert_array_equal(obs, [[2, 3], [0, 3], [3, 2], [2, 2]])
+
+
+class Limited(Simulator):
+    """Every end is a termination, and ``extras["time_outs"]`` says which are none."""
+
+    def step(self, action: th.Tensor) -> Any:
+        obs, reward, died, late, extras = super().step(action)
+        return obs, reward, died | late, th.zeros_like(late), {**extras, "time_outs": late}
+
+
+def test_time_outs_may_be_told_apart():
+    env = TensorVecEnv(Limited())
+    env.envs.lives = 5.0  # row 0 dies, the others are cut
+    env.reset()
+    steps = [env.step(np.zeros((N, 1))) for _ in range(6)]
+    assert steps[4][2].tolist() == [True, False, False, False]
+    assert steps[4][3][0]["TimeLimit.truncated"] is False
+    assert steps[5][2].tolist() == [False, True, True, True]
+    assert [info["TimeLimit.truncated"] for info in steps[5][3][1:]] == [True] * 3
 
 
 def test_a_function_of_tensors_charges():
@@ -121,6 +167,21 @@ def test_it_trains():
     assert sorted({float(c[0]) for c in model.costs.latest}) == [1.0, 2.0, 3.0, 4.0]
 
 
+class Gymnasiums(Simulator, gym.Env):
+    """As those of Isaac Lab, which ``gymnasium.make`` may wrap."""
+
+
+class FourValues(Simulator):
+    def step(self, action: th.Tensor) -> Any:
+        obs, reward, died, late, extras = super().step(action)
+        return obs, reward, died | late, extras
+
+
+class LastOfFew(Simulator):
+    def step(self, action: th.Tensor) -> Any:
+        return *super().step(action)[:4], {**self.extras, "final_obs": {"actor": self.shown[:1]}}
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -131,6 +192,12 @@ def test_it_trains():
             r"cost='costs' .* extras: \['log', 'cost'\]",
         ),
         (lambda: stepped(lambda *_: th.zeros(N, 1)), "is no tensor of 4 numbers"),
+        (
+            lambda: TensorVecEnv(gym.wrappers.TimeLimit(Gymnasiums(), 5)),
+            "TimeLimit ends all rows at once: set the episode length of Gymnasiums",
+        ),
+        (lambda: stepped("cost", FourValues()), "step returned 4 values, not five"),
+        (lambda: stepped("cost", LastOfFew()), r"'final_obs'\] has no tensor of shape \(4, 2\)"),
     ],
 )
 def test_what_can_not_be_is_a_line(make, message):
@@ -139,27 +206,27 @@ def test_what_can_not_be_is_a_line(make, message):
     assert "\n" not in str(caught.value)
 
 
-def stepped(cost: Any) -> Any:
-    env = TensorVecEnv(Simulator(), cost=cost)
+def stepped(cost: Any, simulator: Any = None) -> Any:
+    env = TensorVecEnv(simulator or Simulator(), cost=cost)
     env.reset()
     return env.step(np.zeros((N, 1)))
 
 
 @pytest.mark.slow
 def test_mjlab_trains_on_a_processor():
-    """Its velocity task; the cost is a metric, since that is computed before rows are reset."""
+    """Its velocity task within a limit on the torques of its joints [N m]."""
     envs = pytest.importorskip("mjlab.envs")
     metrics = pytest.importorskip("mjlab.managers.metrics_manager")
     from mjlab.tasks.registry import load_env_cfg
 
-    def effort(env: Any) -> th.Tensor:
-        env.extras["cost"] = (env.action_manager.action.abs().mean(dim=1) > 0.5).float()
+    def torque(env: Any) -> th.Tensor:
+        env.extras["cost"] = env.scene["robot"].data.actuator_force.abs().mean(dim=1)
         return env.extras["cost"]
 
     cfg = load_env_cfg("Mjlab-Velocity-Flat-Unitree-Go1")
-    cfg.scene.num_envs, cfg.episode_length_s = 8, 1.0
-    cfg.metrics["cost"] = metrics.MetricsTermCfg(func=effort)
+    cfg.scene.num_envs, cfg.episode_length_s, cfg.auto_reset = 8, 1.0, False
+    cfg.metrics["cost"] = metrics.MetricsTermCfg(func=torque)
     env = make_vec_env(TensorVecEnv(envs.ManagerBasedRlEnv(cfg, device="cpu")), seed=0)
     model = PPOLag("MlpPolicy", env, n_steps=60, batch_size=120, cost_limit=10.0).learn(960)
     assert env.episode_count >= 16 and model.costs.horizon <= 50
-    assert 0.0 < model.costs.episode_cost[0] < 50.0
+    assert 0.0 < model.costs.episode_cost[0] < 500.0

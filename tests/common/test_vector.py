@@ -1,6 +1,9 @@
 """Vector environments of Gymnasium, against the same environments one by one."""
 
 import copy
+import os
+from contextlib import closing
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -296,6 +299,47 @@ def without_a_mode(mode: Any) -> Any:
     env = Batch()
     env.metadata = {"autoreset_mode": mode}
     return env
+
+
+class Dying(Staggered):
+    """The process that steps it ends, or an error of its code does that."""
+
+    def __init__(self, error: type[Exception] | None = None) -> None:
+        super().__init__()
+        self.error = error
+
+    def step(self, action):
+        if self.error is None:
+            os._exit(1)
+        raise self.error("stuck\nin a corner")
+
+
+@pytest.mark.parametrize("error", [None, ValueError])
+@pytest.mark.parametrize("row", range(N))
+def test_a_process_that_dies_is_told_and_ends_the_others(row, error):
+    makers = [partial(Dying, error) if i == row else Staggered for i in range(N)]
+    with closing(as_vec_env(gym.vector.AsyncVectorEnv(makers, context="fork"))) as env:
+        env.reset()
+        with pytest.raises(ConnectionError, match="a process of AsyncVectorEnv has died"):
+            env.step(np.zeros((N, 3), np.float32))
+    for process in env.envs.processes:
+        process.join(10)
+        assert not process.is_alive()
+
+
+def test_an_interrupted_step_ends_the_processes(monkeypatch):
+    """Their answers are lost, so that ``close`` would wait for them."""
+    envs = gym.vector.AsyncVectorEnv([Staggered] * 2, context="fork")
+    with closing(as_vec_env(envs)) as env, pytest.raises(KeyboardInterrupt):
+        env.reset()
+        envs.step_async(np.zeros((2, 3), np.float32))
+        envs.parent_pipes[0].recv()
+
+        def interrupted(actions):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(envs, "step", interrupted)
+        env.step(np.zeros((2, 3), np.float32))
 
 
 SMALL: dict[str, Any] = {"n_steps": 20, "cost_limit": 1.0}

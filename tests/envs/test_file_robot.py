@@ -293,14 +293,122 @@ def test_reach_and_goals_follow_an_arms_length(arm):
     scenario = arm()
     engine = scenario.build(20)
     reach = engine.robot.reach
-    assert 0.9 * 0.5 < reach < 0.6  # 0.6 m when stretched, of which 90 % counts
+    # from its first joint 0.5 m when stretched, of which 90 % counts
+    assert reach == pytest.approx(0.45, rel=0.02)
     engine.reset(np.arange(20))
     goals = engine.places("goal")[:, 0]
-    assert np.linalg.norm(goals, axis=1).max() <= reach
+    assert np.linalg.norm(goals - [0, 0, 0.1], axis=1).max() <= reach
     assert engine.task.size == pytest.approx(reach / 10, rel=0.02)
     assert scenario.override(goal={"size": 0.2}).build().task.size == 0.2
     planar = scenario.override(hazards={"space": "planar"}).build()
     assert planar.constraints[0].planar
+
+
+# two links of 0.4 m whose shoulder is 5 cm from the joint that turns them
+CRANE = """<mujoco><compiler angle="degree"/><worldbody><body name="base" {base}>
+  <geom size="0.05"/>
+  <body name="turret"><joint name="turn" axis="0 0 1" {turn}/><geom size="0.04"/>
+    <site name="imu"/>
+    <body name="upper" pos="0 0 0.05"><joint name="lift" axis="0 1 0" {lift}/>
+      <geom type="capsule" size="0.02" fromto="0 0 0 0 0 0.4"/>
+      <body name="lower" pos="0 0 0.4"><joint name="elbow" axis="0 1 0" {elbow}/>
+        <geom type="capsule" size="0.02" fromto="0 0 0 0 0 0.4"/>
+        <site name="hand" pos="0 0 0.4"/>
+  </body></body></body></body></worldbody></mujoco>"""
+
+
+@pytest.fixture
+def crane():
+    def write(base, turn="", lift="", elbow="", center="hand", suite="Goal_Crane_0Hazards"):
+        text = CRANE.format(base=base, turn=turn, lift=lift, elbow=elbow)
+        spec = add_servos(mujoco.MjSpec.from_string(text))
+        register_robot("Crane", xml=spec, center=center)
+        return Scenario.parse(suite)
+
+    with own_parts():
+        yield write
+
+
+def goals_of(engine):
+    """First and second goals of 100 episodes in 20 rows, [200, 3] m."""
+    rows, goals = np.arange(20), []
+    for row in rows:
+        engine.seed(int(row), np.random.default_rng(row))
+    for _ in range(5):
+        engine.reset(rows)
+        goals.append(engine.places("goal")[:, 0].copy())
+        engine.task.advance(rows)
+        goals.append(engine.places("goal")[:, 0].copy())
+    return np.concatenate(goals)
+
+
+@pytest.mark.parametrize(
+    ("base", "up"),
+    [
+        ('pos="0 0 0.8"', [0, 0, 1]),
+        ('pos="0 0 1.2" euler="180 0 0"', [0, 0, -1]),
+        ('pos="0 0 0.9" euler="0 90 0"', [1, 0, 0]),
+    ],
+    ids=["raised", "hanging", "sideways"],
+)
+def test_reach_is_measured_from_an_arms_first_joint(crane, base, up):
+    engine = crane(base).override(robot={"locations": [[0.3, -0.2]]}).build(20)
+    height = float(base.split('"')[1].split()[2])
+    np.testing.assert_allclose(engine.robot.reach_center, [0.3, -0.2, height])
+    assert engine.robot.reach == pytest.approx(0.76, abs=0.01)  # 90 % of 0.85 m
+    goals = goals_of(engine)
+    shoulder = np.add([0.3, -0.2, height], np.multiply(0.05, up))
+    assert np.linalg.norm(goals - shoulder, axis=1).max() <= 0.8 + engine.task.size
+    assert np.ptp(goals[:, 2]) > 0.3 and goals[:, 2].min() > 0
+
+
+@pytest.mark.parametrize("heading", [0.0, 2.0])
+def test_goals_lie_where_an_arm_turns_to(crane, heading):
+    """Its hand is always ahead: it turns by 45 degrees either way and bends forwards only."""
+    scenario = crane(
+        'pos="0 0 0.3"', 'range="-45 45"', lift='range="20 60"', elbow='range="0 60"'
+    ).override(robot={"locations": [[1.0, 1.0]], "heading": heading})
+    goals = goals_of(scenario.build(20)) - [1.0, 1.0, 0.0]
+    assert (goals[:, :2] @ [np.cos(heading), np.sin(heading)]).min() > 0
+
+
+def test_objects_on_the_floor_are_out_of_reach_of_an_arm_on_a_high_table(crane):
+    base = crane('pos="0 0 0.9"', suite="Goal_Crane_2Hazards")
+    with pytest.raises(
+        ValueError, match=r"ball: height is out of .* 0\.90 m from \(0\.0, 0\.0, 0\.9\)"
+    ):
+        Scenario.parse("Push_Crane_0Hazards").build()
+    above = base.override(hazards={"space": "planar"}).build()  # where heights do not count
+    above.reset(ROW)
+    listed = [[0.3, 0.3], [0.1, -0.4], [0.2, 0.2]]
+    engine = base.override(goal={"locations": listed}).build()
+    engine.reset(ROW)
+    assert engine.places("goal")[0, 0, :2].tolist() in listed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("turn", ["", 'range="-100 100"'], ids=["all around", "ahead"])
+@pytest.mark.parametrize(
+    "base",
+    ['pos="0 0 0.8"', 'pos="0 0 1.2" euler="180 0 0"', 'pos="0 0 0.9" euler="0 90 0"'],
+    ids=["raised", "hanging", "sideways"],
+)
+def test_nearly_all_goals_of_an_arm_can_be_reached(crane, base, turn):
+    engine = crane(base, turn, 'range="-110 110"', 'range="-140 0"').build(20)
+    goals, rng = goals_of(engine), np.random.default_rng(0)
+    model, data = ROBOTS["Crane"].model_file().standing()
+    gaps = np.full(len(goals), np.inf)
+    low, high = np.where(model.jnt_limited, model.jnt_range.T, [[-np.pi], [np.pi]])
+    for _ in range(50_000):
+        data.qpos[:] = rng.uniform(low, high)
+        mujoco.mj_kinematics(model, data)
+        gaps = np.minimum(gaps, np.linalg.norm(goals - data.site("hand").xpos, axis=1))
+    assert np.mean(gaps <= engine.task.size) >= 0.95
+
+
+def test_an_arm_that_never_rises_above_the_floor_is_answered_in_a_line(crane):
+    with pytest.raises(ValueError, match=r"'imu' is never above the floor, .*: raise .* by pos"):
+        crane('pos="0 0 0"', center="imu")
 
 
 def test_clearance_of_an_arm_is_that_of_its_nearest_link(arm):
@@ -356,6 +464,11 @@ def test_what_is_no_robot_is_answered_in_a_line(dog, change, stated, message):
     with pytest.raises(ValueError, match=message) as caught:
         dog(change, **stated)
     assert "\n" not in str(caught.value) and "Dog" not in ROBOTS
+
+
+def test_the_end_effector_that_is_advised_has_most_joints_above_it(crane):
+    with pytest.raises(ValueError, match=r"cannot move: .* center='hand'"):
+        crane('pos="0 0 0"', center=None)
 
 
 @pytest.mark.parametrize("center", [None, "base"])

@@ -125,13 +125,17 @@ def test_heights_lie_in_their_range_and_within_reach():
     rng = np.random.default_rng(0)
     free = Footprint("free", 8, 0.2, ARENA, height=(0.5, 1.5))
     near = Footprint("near", 4, 0.2, ARENA, height=(0.5, 1.5), reach=1.2)
+    high = Footprint("high", 4, 0.2, ARENA, height=(0.5, 1.5), reach=0.9, reach_center=(0, 0, 1.3))
     flat = Footprint("flat", 1, 0.2, ARENA, height=0.26)
-    layouts = [arrange([free, near, flat], rng) for _ in range(100)]
+    layouts = [arrange([free, near, high, flat], rng) for _ in range(100)]
     z = np.concatenate([layout["free"][:, 2] for layout in layouts])
     assert stats.kstest(z, stats.uniform(0.5, 1.0).cdf).pvalue > 1e-3
     points = np.concatenate([layout["near"] for layout in layouts])
     assert (np.linalg.norm(points, axis=1) <= 1.2 + 1e-12).all()
     assert points[:, 2].min() >= 0.5
+    points = np.concatenate([layout["high"] for layout in layouts])
+    assert (np.linalg.norm(points - [0, 0, 1.3], axis=1) <= 0.9 + 1e-12).all()
+    assert 0.5 <= points[:, 2].min() < 0.8 and points[:, 2].max() <= 1.5
     assert all(layout["flat"][0, 2] == 0.26 for layout in layouts)
 
 
@@ -169,8 +173,13 @@ def test_what_cannot_be_placed_is_named(parts, words):
             r"height is out of .* reach: 2\.50 m .* reaches 2\.0",
         ),
         (
-            {"locations": ((0, 0), (0, 1.5)), "base": (2, 1.5), "reach": 2.2, "height": (1, 2)},
-            r"location \(0, 0\) is out of .* reach: 2\.69 m from its base at \(2, 1\.5\)",
+            {
+                "locations": ((0, 0), (0, 1.5)),
+                "reach_center": (2, 1.5, 0),
+                "reach": 2.2,
+                "height": (1, 2),
+            },
+            r"location \(0, 0\) is out of .* reach: 2\.69 m from \(2, 1\.5, 0\) even",
         ),
     ],
 )

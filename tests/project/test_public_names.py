@@ -18,7 +18,7 @@ PRIVATE = re.compile(r"_[a-zA-Z]\w*")
 ALLOWED = {
     "Stable-Baselines3's hooks for subclasses and their state": {
         "_current_progress_remaining", "_get_indices",
-        "_last_episode_starts", "_on_event", "_reset_options", "_reset_seeds",
+        "_last_episode_starts", "_last_obs", "_on_event", "_reset_options", "_reset_seeds",
         "_stats_window_size", "_total_timesteps", "_update_features_extractor",
         "_update_learning_rate", "_vec_normalize_env", "_wrap_env",
     },

@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 import yaml
 from cost_envs import CostPoint
+from gymnasium.vector import AsyncVectorEnv
 from matplotlib import image
 from rl_zoo3.utils import EnvironmentName, get_model_path
 from stable_baselines3.common.monitor import load_results
@@ -254,12 +255,19 @@ def test_a_normalizer_among_the_wrappers_is_refused(tmp_path, capsys):
     assert "VecNormalize in vec_env_wrapper: use normalize" in capsys.readouterr().err
 
 
-def test_processes_of_environments_see_no_interrupt():
-    flags = {"env": "CostPoint-v0", "gym_packages": ["registered_envs"], "vec_env": "subproc"}
+@pytest.mark.parametrize("vec_env", ["subproc", "gymnasium"])
+def test_processes_of_environments_see_no_interrupt(vec_env, monkeypatch):
+    flags = {"env": "CostPoint-v0", "gym_packages": ["registered_envs"], "vec_env": vec_env}
     usage.import_packages(flags["gym_packages"])
+    monkeypatch.setattr(
+        gymnasium.spec("CostPoint-v0"),
+        "vector_entry_point",
+        lambda num_envs: AsyncVectorEnv([CostPoint] * num_envs, context="fork"),
+    )
     run = Run(RunFlags(**flags), {"cost_limit": 1.0})
     with closing(run.make_envs(1, 0)) as env:
-        os.kill(env.unwrapped.processes[0].pid, signal.SIGINT)
+        owner = getattr(env.unwrapped, "envs", env.unwrapped)
+        os.kill(owner.processes[0].pid, signal.SIGINT)
         env.reset()
 
 

@@ -10,7 +10,7 @@ import pytest
 import yaml
 from typed import LENGTH, SMALL, TOY, refused, trained
 
-from sb3_guard import benchmark, enjoy, train
+from sb3_guard import benchmark, certify_agent, enjoy, train
 from sb3_guard.fields import parse_value
 from sb3_guard.zoo.cli.names import BASES, as_data, classes
 from sb3_guard.zoo.cli.usage import UsageError
@@ -106,6 +106,40 @@ def test_a_runs_files_run_nothing(tmp_path, trap, run, capsys):
     assert not trap.exists()
     enjoy.main([*without, "--gym-packages", "hostile"])
     assert trap.exists()
+
+
+RECORDING = [
+    ("env_wrapper", "stable_baselines3.common.monitor.Monitor", "filename"),
+    ("env_wrapper", "gymnasium.wrappers.RecordVideo", "video_folder"),
+    ("vec_env_wrapper", "stable_baselines3.common.vec_env.VecMonitor", "filename"),
+    ("vec_env_wrapper", "sb3_guard.common.monitor.CostMonitor", "filename"),
+    ("vec_env_wrapper", "stable_baselines3.common.vec_env.VecVideoRecorder", "video_folder"),
+]
+
+
+@pytest.mark.parametrize(("kind", "wrapper", "argument"), RECORDING)
+def test_playing_writes_nothing_that_a_runs_files_name(
+    tmp_path, run, kind, wrapper, argument, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    mine = tmp_path / "mine.monitor.csv"
+    mine.write_text("mine")
+    arguments = {argument: "mine" if argument == "filename" else "videos"}
+    if wrapper.endswith("VecVideoRecorder"):
+        arguments["record_video_trigger"] = None
+    enter(run, "config.yml", **{kind: [{wrapper: arguments}]})
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    play, short = ["-f", str(run), *TOY[:2], "--n-episodes", "1"], ["--n-episodes", "100"]
+    assert enjoy.main([*play, "--no-render"]) == 0
+    assert certify_agent.main(["-f", str(run), *TOY[:2], "--cost-limit", "999", *short]) == 0
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+
+
+def test_a_training_writes_what_its_user_names_and_its_evaluations_leave_that(tmp_path):
+    file = tmp_path / "mine.monitor.csv"
+    monitor = {"stable_baselines3.common.monitor.Monitor": {"filename": str(file)}}
+    trained(tmp_path, "-params", "n_envs:1", f"env_wrapper:{monitor}", "--eval-freq", "60")
+    assert len(file.read_text().splitlines()) == 2 + 120 // 20  # a header, and each episode
 
 
 def test_a_run_is_continued_with_the_folders_that_the_user_names_again(tmp_path, run, capsys):

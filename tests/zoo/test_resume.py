@@ -8,9 +8,13 @@ import subprocess
 import sys
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import pandas as pd
 import pytest
+from cost_envs import CostPoint
+from gymnasium.vector import AsyncVectorEnv
 from killed import (
     SHORT,
     SMALL,
@@ -30,7 +34,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_guard import make_vec_env, train
 from sb3_guard.common import vec_env
-from sb3_guard.zoo.cli.usage import UsageError
+from sb3_guard.zoo.cli.usage import UsageError, import_packages
 from sb3_guard.zoo.run import checkpoint
 from sb3_guard.zoo.run import run as run_module
 from sb3_guard.zoo.run.checkpoint import read_checkpoint
@@ -249,24 +253,36 @@ def test_asked_to_stop(undisturbed, tmp_path, monkeypatch, capsys):
     assert_same_run(undisturbed(300), tmp_path)
 
 
-def test_processes_of_environments_die(forked, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("vec_env", ["subproc", "gymnasium"])
+@pytest.mark.parametrize("asked", [False, True])
+def test_processes_of_environments_die(asked, vec_env, forked, tmp_path, monkeypatch, capsys):
     """For want of memory, or by a SIGTERM to the whole process group, as batch systems send it."""
     whole = Epochs._on_step
+    import_packages(["registered_envs"])
+    monkeypatch.setattr(gym.spec("CostPoint-v0"), "vector_entry_point", in_processes)
 
     def step(self):
         if self.num_timesteps == 100:
-            for one in multiprocessing.active_children():
+            for one in multiprocessing.active_children()[:1]:
                 one.kill()
+            if asked:
+                os.kill(os.getpid(), signal.SIGTERM)
         return whole(self)
 
     monkeypatch.setattr(Epochs, "_on_step", step)
-    arguments = [*TOY, *SHORT, *SMALL, "--eval-freq", "-1", "-n", "120", "--vec-env", "subproc"]
-    assert train.main([*arguments, "-f", str(tmp_path)]) == 2
+    arguments = [*TOY, *SHORT, *SMALL, "--eval-freq", "-1", "-n", "120", "--vec-env", vec_env]
+    status = 128 + signal.SIGTERM if asked else 2
+    assert train.main([*arguments, "-f", str(tmp_path)]) == status
     run = runs_of(tmp_path)
     err = capsys.readouterr().err
-    assert "--vec-env subproc has died" in err and "memory" in err
-    assert f"continue with: sb3-guard train -i {run} --gym-packages registered_envs" in err
+    assert "Traceback" not in err
+    assert asked == (f"--vec-env {vec_env} has died" not in err)
+    assert asked or f"continue with: sb3-guard train -i {run} --gym-packages" in err
     assert read_checkpoint(run / "checkpoint.zip")["num_timesteps"] == 60
+
+
+def in_processes(num_envs: int = 1, **kwargs: Any) -> AsyncVectorEnv:
+    return AsyncVectorEnv([partial(CostPoint, **kwargs)] * num_envs, context="fork")
 
 
 def test_a_state_of_another_environment_is_refused_in_a_line():

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from full_disk import files_end_at
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3.utils import get_latest_run_id, get_saved_hyperparams
 
@@ -115,6 +116,18 @@ def test_an_owner_elsewhere_may_be_alive(tmp_path):
     with pytest.raises(RunInUse, match="process 12 on elsewhere; if that is gone, remove"):
         with lock(run.path):
             pass
+
+
+def test_a_full_disk_is_told_where_the_lock_of_a_dead_owner_can_not_be_replaced(tmp_path):
+    run = create(tmp_path)
+    die_holding(run.path)
+    before = {path: path.stat().st_size for path in run.path.iterdir()}
+    with files_end_at(0), pytest.raises(UsageError, match="can't write to .*: File too large"):
+        with lock(run.path):
+            pass
+    assert {path: path.stat().st_size for path in run.path.iterdir()} == before
+    with lock(run.path):
+        pass
 
 
 def test_files_appear_whole_or_not_at_all(tmp_path):

@@ -32,6 +32,11 @@ from sb3_guard.judging import Limits
 from sb3_guard.lost_costs import refuse_lost_costs
 from sb3_guard.vector import as_vec_env, lacks_statistics, moments_of, normalizer_of
 
+BROKEN_OFF = (
+    "eval_env is the training environment, whose episodes every evaluation would break off: make "
+    "another one for it"
+)
+
 
 class Constrained(BaseAlgorithm):
     """Cost keys, limits and episode costs in addition to an algorithm of Stable-Baselines3.
@@ -233,13 +238,16 @@ class Constrained(BaseAlgorithm):
         theirs = inspect.signature(super().learn)  # type: ignore[safe-super]
         if tb_log_name == theirs.parameters["tb_log_name"].default:
             tb_log_name = type(self).__name__
-        begun = super()._setup_learn(
+        return super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
-        self.collecting = self.num_timesteps < begun[0]
-        return begun
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> Any:
+        """
+        :raises ValueError: an evaluation has reset the environments since ``learn`` began
+        """
+        if self._last_obs is None:
+            raise ValueError(BROKEN_OFF)
         self.collecting = True
         try:
             return super().collect_rollouts(*args, **kwargs)  # type: ignore[misc]

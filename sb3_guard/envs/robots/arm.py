@@ -1,11 +1,13 @@
 """Arms stand still and are as near to things as their nearest link."""
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from sb3_guard.envs import geometry
+from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Simulation
 from sb3_guard.envs.robots.robot import PREFIX, MJCFRobot, as_slice
 from sb3_guard.envs.types import Array
@@ -46,6 +48,22 @@ class Arm(MJCFRobot):
 @dataclass
 class FileArm(MJCFRobot):
     """An arm of anybody's file: a link is the capsule around a geom that meets something."""
+
+    heading: float = param(0.0, "heading, rad")  # never random: not all arms turn all around
+    near: ClassVar[tuple[str, ...]] = ("goal", "hazards", "ghosts")  # parts in its reach
+    shoulder: ClassVar[Array]  # where its first joint is in the file, [3] m
+    places: ClassVar[Array]  # where its end effector can be, [n, 3] m, likewise
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        cos, sin = math.cos(self.heading), math.sin(self.heading)
+        turn = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        self.hand = self.places @ turn + self.reach_center
+        x, y, z = (self.shoulder @ turn + self.reach_center).tolist()
+        self.reach_center = (x, y, z)
+        square = [x - self.reach, y - self.reach, x + self.reach, y + self.reach]
+        suited = {kind: {"placements": [square], **self.defaults[kind]} for kind in self.near}
+        self.defaults = {**self.defaults, **suited}
 
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)

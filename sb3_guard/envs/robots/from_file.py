@@ -11,9 +11,10 @@ import numpy as np
 
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.robots.arm import FileArm
-from sb3_guard.envs.robots.measure import radius, reached
+from sb3_guard.envs.robots.measure import chain, radius, reached
 from sb3_guard.envs.robots.model_file import ModelFile, settle
 from sb3_guard.envs.robots.robot import PREFIX, MJCFRobot
+from sb3_guard.envs.types import Array
 from sb3_guard.fields import fit
 from sb3_guard.spelling import did_you_mean
 
@@ -27,8 +28,8 @@ ATTRIBUTES: dict[str, tuple[str, str, tuple[Any, ...]]] = {
     "keyframe": ("start, home or the only one", "the keyframe in which it starts", (str | None,)),
     "center": ("the outermost body", "the body or site whose place is the robot's position: of an "
         "arm, its end effector", (str | None,)),
-    "reach": ("infinite; of an arm, measured", "how far an arm reaches from its base, m; goals are "
-        "drawn within", (float, 0)),
+    "reach": ("infinite; of an arm, measured", "how far an arm reaches from its first joint, m; "
+        "goals are drawn within", (float, 0)),
     "keepout": ("what covers the robot", "radius kept clear around it at the start, m",
         (float, 0, math.inf, "[)")),
     "defaults": ("for arms, sizes that suit their reach; for large robots, a larger arena",
@@ -80,7 +81,9 @@ def robot_class(
     }
     arm = not file.base and not complete
     if arm:
-        attributes |= _arm(model, center, tip is not None)
+        shoulder = data.xanchor[chain(model, model.body(body).id)[0]]
+        places = reached(model, body, tip)
+        attributes |= _arm(f"{file.label}: {center!r}", places, shoulder, stated.get("reach"))
     defaults = {key: {**params} for key, params in attributes["defaults"].items()}
     for key, params in stated.get("defaults", {}).items():
         defaults[key] = {**defaults.get(key, {}), **params}
@@ -109,30 +112,38 @@ def _center(model: mujoco.MjModel, file: ModelFile, center: str) -> tuple[str, s
     tip = None if center in bodies else center
     body = model.body(center).id if tip is None else int(model.site(center).bodyid[0])
     if model.body_weldid[body] == 0:
-        moving = [n for n in sites if n and model.body_weldid[model.site(n).bodyid[0]]]
-        moving += [n for n in bodies[::-1] if n and model.body_weldid[model.body(n).id]]
+        places = {n: int(model.site(n).bodyid[0]) for n in sites if n}
+        places |= {n: model.body(n).id for n in bodies[::-1] if n}
+        end = max(places, key=lambda name: len(chain(model, places[name])))
         raise ValueError(
             f"{file.label} stands on a fixed base, and {center!r}, whose place is the robot's "
-            f"position, cannot move: name its end effector, a body or site, center={moving[0]!r}"
+            f"position, cannot move: name its end effector, a body or site, center={end!r}"
         )
     return str(model.body(body).name), tip
 
 
-def _arm(model: mujoco.MjModel, center: str, site: bool) -> dict[str, Any]:
-    """What follows from the reach of a robot on a fixed base."""
-    places = reached(model, center, site)
-    reach = 0.9 * float(np.sqrt((places**2).sum(axis=1)).max())
-    low, high = np.quantile(places[places[:, 2] > 0, 2], [0.2, 0.8]).tolist()
+def _arm(end: str, places: Array, shoulder: Array, reach: float | None) -> dict[str, Any]:
+    """What follows from where an arm's end effector can be, [n, 3] m, and from its first joint.
+
+    :param reach: None: measured
+    :raises ValueError: its end effector, ``end``, is never above the floor
+    """
+    away = np.linalg.norm(places - shoulder, axis=1)
+    reach = reach or 0.9 * float(away.max())
+    places = places[(away <= reach) & (places[:, 2] >= 0.001)]
+    if not len(places):
+        raise ValueError(
+            f"{end} is never above the floor, z = 0: raise its outermost body by pos, or name "
+            "another end effector, center="
+        )
+    low, high = np.quantile(places[:, 2], [0.2, 0.8]).tolist()
     size = round(0.1 * reach, 3)
-    square = [[-reach, -reach, reach, reach]]
     near = {"size": size, "keepout": size, "height": [round(low, 3), round(high, 3)]}
     return {
         "workspace": "spatial",
         "reach": round(reach, 3),
+        "shoulder": shoulder.round(3),
+        "places": places,
         "keepout": size,
-        "defaults": {
-            "goal": near | {"placements": square},
-            "hazards": near | {"placements": square},
-            "ghosts": near | {"placements": square},
-        },
+        "defaults": dict.fromkeys(FileArm.near, near),
     }

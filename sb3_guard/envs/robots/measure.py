@@ -7,7 +7,7 @@ import numpy as np
 
 from sb3_guard.envs.types import Array
 
-SAMPLES = 1000  # random poses of an arm, from which its reach is measured
+SAMPLES = 2000  # random poses of an arm, from which its reach is measured
 
 
 def radius(model: mujoco.MjModel, data: mujoco.MjData, root: str) -> float:
@@ -17,12 +17,8 @@ def radius(model: mujoco.MjModel, data: mujoco.MjData, root: str) -> float:
     return float((np.hypot(*away.T) + model.geom_rbound[solid]).max(initial=0.0))
 
 
-def reached(model: mujoco.MjModel, center: str, site: bool) -> Array:
-    """Where an arm's end effector is in random poses, [SAMPLES, 3] m.
-
-    :param center: name of the end effector
-    :param site: whether it is a site, not a body
-    """
+def reached(model: mujoco.MjModel, body: str, site: str | None) -> Array:
+    """Where an arm's end effector, a body or a site on it, is in random poses, [SAMPLES, 3] m."""
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     low, high = np.where(model.jnt_limited, model.jnt_range.T, [[-math.pi], [math.pi]])
     single = np.isin(model.jnt_type, [mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE])
@@ -31,8 +27,18 @@ def reached(model: mujoco.MjModel, center: str, site: bool) -> Array:
     for place in places:
         data.qpos[where] = rng.uniform(low, high)[single]
         mujoco.mj_kinematics(model, data)
-        place[:] = data.site(center).xpos if site else data.body(center).xpos
+        place[:] = data.body(body).xpos if site is None else data.site(site).xpos
     return places
+
+
+def chain(model: mujoco.MjModel, body: int) -> list[int]:
+    """The joints that move a body, the first one first."""
+    joints: list[int] = []
+    while body:
+        first = model.body_jntadr[body]
+        joints = [*range(first, first + model.body_jntnum[body]), *joints]
+        body = model.body_parentid[body]
+    return joints
 
 
 def lowest(model: mujoco.MjModel, data: mujoco.MjData) -> Array:

@@ -132,14 +132,11 @@ class MJCFRobot(Robot):
                 f"robot.placements = {self.placements!r}: a robot of limited reach stands at a "
                 "fixed place; set robot={'locations': [[x, y]]}"
             )
-
-    @property
-    def base(self) -> tuple[float, float]:
-        return self.locations[0] if self.locations else (0.0, 0.0)
+        self.reach_center = (*(self.locations or ((0.0, 0.0),))[0], 0.0)
 
     def footprints(self) -> tuple[Footprint, ...]:
         stands = self.complete or math.isfinite(self.reach)
-        places = self.locations or ((self.base,) if stands else ())
+        places = self.locations or (((0.0, 0.0),) if stands else ())
         return (Footprint("robot", 1, self.keepout, self.placements, places, self.margin),)
 
     @classmethod

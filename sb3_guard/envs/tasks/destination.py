@@ -50,8 +50,7 @@ class Destination(Task):
                 self.locations if len(self.locations) == 1 else (),
                 self.margin,
                 height=0.0 if self.planar else self.height,
-                reach=self._reach,
-                base=self._base,
+                **self._within,
                 redrawn=not self.ends,
                 last=self.last,
                 among=self.locations if len(self.locations) > 1 else (),
@@ -61,7 +60,9 @@ class Destination(Task):
 
     def build(self, world: World) -> None:
         super().build(world)
-        self._reach, self._base = world.robot.reach, world.robot.base
+        self._within = world.robot.within(self.planar)
+        if not self.planar:
+            self._within["hand"] = world.robot.hand
 
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)

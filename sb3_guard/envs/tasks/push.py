@@ -88,8 +88,7 @@ class Push(Destination):
             self.object_placements or self.placements,
             self.object_locations,
             self.margin if self.object_margin is None else self.object_margin,
-            reach=world.robot.reach,
-            base=world.robot.base,
+            **world.robot.within(planar=False),
             cover=self.object_radius,
             label=f"{self.name}.object_keepout",
         )

@@ -18,7 +18,7 @@ from sb3_guard.zoo.run.folder import EPOCH, PLAYED
 
 SCORES = {"J_r": "reward", "M_c": "cost", "rho_c": "cost_rate"}
 EPOCHS = 10  # at the end of a run, that its training is judged by
-#: by key what was played; the final ones are in ``result.json``, see ``Training``
+#: Labels of the episodes by key; those played after the training are in ``result.json``.
 SPLITS = {
     "training": "training episodes",
     **{split: f"final, {actions}" for split, actions in PLAYED.items()},

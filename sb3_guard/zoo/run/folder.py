@@ -9,6 +9,7 @@ import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import yaml
@@ -220,6 +221,8 @@ def lock(folder: Path) -> Iterator[None]:
         try:
             held.acquire()
         except Timeout:
+            with TemporaryFile(dir=folder) as room:  # on a full disk no lock can be taken over
+                room.write(b"room")
             owner = path.read_text().split("\n")
             if owner != [""]:
                 raise RunInUse(

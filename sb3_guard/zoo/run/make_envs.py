@@ -14,7 +14,7 @@ BAD_NUMBERS = (FloatingPointError, WorldError, ContractError)
 BAD_ARGUMENTS = (
     ValueError, TypeError, AssertionError, KeyError, ImportError, gym.error.Error, WorldError
 )  # fmt: skip
-# What a SubprocVecEnv raises when one of its processes has died.
+# What is raised when a process of --vec-env subproc or gymnasium has died.
 PROCESS_DIED = (EOFError, ConnectionError)
 
 

@@ -7,6 +7,7 @@ and resets counters, seeds and environments when it continues; so its pieces are
 
 import copy
 import dataclasses
+import pickle
 import shlex
 import signal
 import sys
@@ -17,6 +18,7 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, suppress
 from dataclasses import dataclass, field
 from functools import cached_property
+from multiprocessing.util import register_after_fork
 from pathlib import Path
 from typing import Any, Self
 
@@ -24,12 +26,20 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from gymnasium.wrappers import RecordVideo
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import (
+    VecEnv,
+    VecFrameStack,
+    VecMonitor,
+    VecNormalize,
+    VecVideoRecorder,
+)
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.algorithms.common.costs import limits_at, time_limit
@@ -142,14 +152,16 @@ class Run:
         """
         The classes that ``env_wrapper`` or ``vec_env_wrapper`` names, and their arguments.
 
-        :param evaluation: without what ends episodes early, or changes rewards
+        :param evaluation: without what ends episodes early, changes rewards, or writes files
         """
         wrappers = []
         for cls, arguments in classes(kind, self.hyperparams.get(kind)):
             if evaluation:
-                for name in getattr(cls, "training_arguments", ()):
+                written = ["filename"] if issubclass(cls, (Monitor, VecMonitor)) else []
+                for name in (*written, *getattr(cls, "training_arguments", ())):
                     arguments.pop(name, None)
-            if not (evaluation and getattr(cls, "training_only", False)):
+            records = issubclass(cls, (RecordVideo, VecVideoRecorder))
+            if not (evaluation and (records or getattr(cls, "training_only", False))):
                 wrappers.append((cls, arguments))
         return wrappers
 
@@ -358,6 +370,9 @@ class Run:
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
             import_packages(packages)  # which a process of its own has not imported
             return source.make(**arguments)
+
+        if vec_env == "gymnasium":  # the same, for processes that the environment starts itself
+            register_after_fork(self, lambda _: signal.signal(signal.SIGINT, signal.SIG_IGN))
 
         def wrap(env: gym.Env) -> gym.Env:
             for cls, arguments in single:
@@ -709,10 +724,12 @@ class Run:
                 f"training stopped at {self.model.num_timesteps} steps: {one_line(error)}"
             ) from error
         except PROCESS_DIED as error:
-            if self.flags.vec_env != "subproc":
+            if self.flags.vec_env not in ("subproc", "gymnasium"):
                 raise
+            if checkpoints.asked_to_stop():  # the signal was for all processes
+                return False
             raise UsageError(
-                "a process of --vec-env subproc has died, because of an error printed above, by a "
+                f"a process of --vec-env {self.flags.vec_env} has died, by an error told above, a "
                 f"signal or for lack of memory; continue with: {folder.again(self.flags)}"
             ) from error
         return True
@@ -725,7 +742,8 @@ class Run:
             self.model.save(file)
         normalizer = normalizer_of(self.env)
         if normalizer is not None:
-            normalizer.save(str(folder.normalizer))
+            with replacing(folder.normalizer) as file:
+                pickle.dump(normalizer, file)
         played = (self.delivery and self.delivery.final) or self._play_final() if finished else {}
         final = {name: _data(played[name == "greedy"]) for name in PLAYED if played}
         final = {name: data for name, data in final.items() if data["returns"]}  # that have ended

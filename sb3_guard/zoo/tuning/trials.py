@@ -225,6 +225,6 @@ class Objective:
         except PROCESS_DIED as error:
             if self.stopped():  # the signal was for all processes
                 raise Stopped from error
-            raise UsageError("a process of --vec-env subproc has died") from error
+            raise UsageError(f"a process of --vec-env {self.training.vec_env} has died") from error
         finally:
             training.close()

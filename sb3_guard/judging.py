@@ -189,6 +189,7 @@ class Bound:
         :raises ValueError: a cost is below 0 or above ``most``
         """
         worst = min(costs.min(), 0.0) or costs.max()
+        ends: tuple[Any, Any]
         if most is None:
             ends = lower_bound(costs, errors[0]), upper_bound(costs, errors[1])
         elif not 0.0 <= worst <= most:

@@ -161,8 +161,9 @@ def write(run: RunFolder, limit: float | None, got: dict[str, Certificate]) -> R
     (path / run.name / "args.yml").write_bytes(with_log_folder(run.params / "args.yml", "logs"))
     copy = RunFolder(path)
     policy = original.policy.state_dict()
-    saved: dict[str, Any] = {"policy": {n: t.clone() for n, t in policy.items()
-                                        if not n.startswith(tuple(f"{part}." for part in TRAINING_ONLY))}}  # fmt: skip
+    left_out = tuple(f"{part}." for part in TRAINING_ONLY)
+    acting = {n: t.clone() for n, t in policy.items() if not n.startswith(left_out)}
+    saved: dict[str, Any] = {"policy": acting}
     if (normalizer := original.get_vec_normalize_env()) is not None:
         for name in ("mean", "var"):
             saved[name] = th.as_tensor(getattr(normalizer.obs_rms, name), dtype=th.float64)

@@ -323,6 +323,6 @@ def _play(
     if played.copies:
         raise ValueError(
             "the environments play copies of one episode: reset(seed=...) must draw another one "
-            "for each seed"
+            "for each seed (where nothing is random, one episode tells all)"
         )
     return played

@@ -78,7 +78,7 @@ class Evaluation:
         """Mean return and costs, ± their standard errors, and the limits."""
         words = [f"return {Mean.of(self.returns)}"]
         if self.limits.on == "max" or len(self.limits.keys) > 1:
-            words.append(f"cost {Mean.of(self.costs)}")
+            words.append(f"total cost {Mean.of(self.costs)}")
         limited = self.limits.described(self.limited).items()
         return ", ".join([*words, *(f"{name} {cost}" for name, cost in limited)])
 
@@ -341,7 +341,7 @@ def _constant_mode(policy: Any) -> Iterator[None]:
     if not isinstance(policy, th.nn.Module) or not hasattr(policy, "set_training_mode"):
         yield
         return
-    policy.set_training_mode(False)
+    policy.set_training_mode(False)  # type: ignore[operator]
     object.__setattr__(policy, "set_training_mode", lambda mode: None)
     try:
         yield

@@ -1,4 +1,4 @@
-"""Whole episodes, counted fairly, with an honest interval."""
+"""Whole episodes, counted fairly, each with a seed of its own."""
 
 import dataclasses
 import io
@@ -29,7 +29,7 @@ from sb3_guard.common.evaluation import (
     sync_normalization,
 )
 from sb3_guard.common.monitor import CostMonitor
-from sb3_guard.costs import estimate, interval
+from sb3_guard.judging import Mean
 
 
 class Fixed(gym.Env):
@@ -86,7 +86,7 @@ def test_sums_by_hand():
 
 def test_stops_after_max_steps():
     result = evaluate_policy(Idle(), fixed(2, 5), n_eval_episodes=100, max_steps=4)
-    assert result.lengths.tolist() == [2, 2]
+    assert result.lengths.tolist() == [2]
     assert result.unfinished[:, [0, 2]].tolist() == [[4.0, 4.0]]  # return and steps of the other
 
 
@@ -108,14 +108,14 @@ def test_a_policy_that_acts_on_costs_gets_the_last_ones():
     model = Idle(acts_on_cost=True)
     evaluate_policy(model, fixed(2, 3), n_eval_episodes=4)
     seen = [state[0][:, 0].tolist() for state in model.states]
-    # Row 0 starts anew at steps 2 and 4, row 1 at step 3: no cost then.
-    assert seen[:5] == [[0, 0], [10, 10], [0, 20], [10, 0], [0, 10]]
+    # Row 0 starts anew at step 2, both at step 3: no cost then.
+    assert seen == [[0, 0], [10, 10], [0, 20]] * 2
 
 
 def test_other_policies_keep_their_own_state_and_see_where_episodes_start():
     model = Idle()
     evaluate_policy(model, fixed(2), n_eval_episodes=2)
-    assert model.states == [None, "memory", "memory", "memory"]
+    assert model.states == [None, "memory"] * 2
     assert [one[0] for one in model.starts] == [True, False, True, False]
 
 
@@ -193,24 +193,6 @@ def test_seeded_evaluation_repeats_and_leaves_training_alone(deterministic):
     np.testing.assert_array_equal(first.returns, again.returns)
     np.testing.assert_array_equal(first.costs, again.costs)
     assert not np.array_equal(first.returns, other.returns)
-
-
-def evaluation(values) -> Evaluation:
-    values = np.asarray(values, float)
-    return Evaluation(values, values, values, values[:, None])
-
-
-def test_estimate_by_hand():
-    # Of two values a resample has mean 1, 2 or 3, with probabilities 1/4, 1/2, 1/4.
-    assert interval(np.array([1.0, 3.0])) == (1.0, 3.0)
-    values = np.random.default_rng(0).normal(3.0, 2.0, size=400)
-    error = 1.96 * values.std() / 20
-    normal = values.mean() - error, values.mean() + error
-    assert interval(values) == pytest.approx(normal, abs=0.02)
-    # Of five of which one is 5 it has k/5 times 5, k binomial: 0 in 33 %, at most 2 in 94 %.
-    mean, std, low, high, _ = estimate(np.array([0.0, 0.0, 0.0, 0.0, 5.0]))
-    assert (mean, std, low, high) == (1.0, 2.0, 0.0, 3.0)
-    assert estimate(np.full(5, 2.0)) == (2.0, 0.0, 2.0, 2.0, 0)
 
 
 class Costs(gym.Wrapper):
@@ -309,43 +291,56 @@ def test_a_policy_of_several_costs_is_told_their_names():
 
 
 def test_an_evaluation_in_words():
-    assert str(evaluation([2.0])).startswith("1 episodes: return 2.000, cost ")
-    assert str(evaluation([1, 3])).startswith("2 episodes: return 2.000 ± 1.000, cost ")
-    words = str(evaluation([0, 0, 0, 0, 5]))
-    assert words.startswith("5 episodes: return 1.000 ± 2.000 (95 % [0.000, 3.000]), cost ")
-    assert "limit" not in words
+    """Means, ± their standard errors, and limits; a verdict is for a certificate."""
     model = CPO("MlpPolicy", CostPoint(10), n_steps=20, cost_limit=30.0, seed=0)
-    assert str(evaluate_policy(model, CostPoint(10), 5)).endswith(", limit 30: kept")
-    assert str(evaluate_policy(model, CostPoint(10), 4)).endswith(", limit 30")
+    seen = evaluate_policy(model, CostPoint(10), 5)
+    mean, error = seen.returns.mean(), seen.returns.std(ddof=1) / 5**0.5
+    assert str(seen) == f"5 episodes: {seen.words}"
+    assert seen.words.startswith(f"return {mean:.3f} ± {error:.3f}, cost ")
+    assert seen.words.endswith(", limit 30")
+    one = evaluate_policy(Idle(), fixed(3), 1)
+    assert str(one) == "1 episodes: return 3.000, cost 60.000"
 
 
 def test_each_of_several_costs_has_its_limit_in_words():
     keys = ("cost", "heat")
     model = CPO("MlpPolicy", CostPoint(10, cost_keys=keys), cost_keys=keys, cost_limit=[30, 0.0])
     seen = evaluate_policy(model, CostPoint(10, hazard=(-1, 0), cost_keys=keys), 5)
-    heat, limit = seen.by_key()["heat"]
-    assert limit == 0.0 and heat == estimate(seen.key_costs[:, 1])
-    total, *words = str(seen).split("; ")
-    assert "limit" not in total
-    assert words[0].startswith("cost ") and words[0].endswith(", limit 30: kept")
-    assert words[1] == f"heat {heat}, limit 0: exceeded"
-    worst = dataclasses.replace(seen, limit_on="max")
-    assert f"; worst step of heat {estimate(seen.max_costs[:, 1])}, limit 0" in str(worst)
+    _, total, cost, _, heat, limit = seen.words.split(", ")
+    assert total == f"total cost {Mean.of(seen.costs)}"
+    assert (cost, heat) == tuple(f"{k} {Mean.of(seen.key_costs[:, i])}" for i, k in enumerate(keys))
+    assert limit == "limit 0"
+    worst = dataclasses.replace(seen, limits=dataclasses.replace(seen.limits, on="max"))
+    assert f", worst step of heat {Mean.of(seen.max_costs[:, 1])}, limit 0" in str(worst)
+
+
+class Seeded(Fixed):
+    """The cost of an episode is the seed that it began with; 1000 without one."""
+
+    def reset(self, *, seed=None, options=None):
+        self.seed = 1000 if seed is None else seed
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        *rest, _ = super().step(action)
+        return *rest, {"cost": self.seed / self.length}
+
+
+@pytest.mark.parametrize("n_envs", [1, 3, 8])
+def test_each_episode_has_a_seed_of_its_own_in_any_number_of_environments(n_envs):
+    env = DummyVecEnv([lambda i=i: Seeded(2 + i % 3) for i in range(n_envs)])
+    seen = evaluate_policy(Idle(), env, 8, seed=40)
+    np.testing.assert_allclose(seen.costs, np.arange(40.0, 48.0))
 
 
 @pytest.mark.parametrize(
-    ("limit", "words"),
-    [(5.0, "limit 5: kept"), (0.9, "limit 0.9: exceeded"), (2.0, "limit 2: undecided")],
+    ("envs", "copies"),
+    [(fixed(3, 3), True), (fixed(3), True), (fixed(3, 4), False), (None, False)],
 )
-def test_a_cost_against_its_limit(limit, words):
-    assert estimate(np.arange(1.0, 6.0)).against(limit) == words
-    assert estimate(np.arange(1.0, 5.0)).against(5.0) == "limit 5"  # few decide nothing
-
-
-def test_no_interval_from_one_episode_and_nothing_from_none():
-    one = evaluation([2.0]).estimate(np.array([2.0]))
-    assert one.mean == 2.0 and np.isnan(one.low) and np.isnan(one.high)
-    assert all(np.isnan(evaluation([]).estimate(np.zeros(0))[:4]))
+def test_copies_of_one_episode_are_told(envs, copies):
+    envs = envs or DummyVecEnv([lambda: CostPoint(10)] * 2)  # begins somewhere else each time
+    assert evaluate_policy(Idle(), envs, 4, seed=0).copies == copies
+    assert not evaluate_policy(Idle(), envs, 1, seed=0).copies
 
 
 def test_an_evaluation_leaves_the_normalization_as_it_is():

@@ -23,9 +23,9 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_guard.common.evaluation import limits_on, shares
 from sb3_guard.common.monitor import cost_keys_of, find_monitor, total_cost
-from sb3_guard.costs import bounded_name, number
+from sb3_guard.costs import number
+from sb3_guard.judging import Limits
 from sb3_guard.vector import each
 from sb3_guard.zoo.agents.flags import EnjoyFlags
 from sb3_guard.zoo.cli.usage import UsageError, explained, interrupts
@@ -60,13 +60,16 @@ class Recorder(VecEnvWrapper):
     ) -> None:
         super().__init__(venv)
         self.cost_keys, self.write, self.stop = cost_keys, write, stop
-        self.left = shares(n_episodes, venv.num_envs)
+        self.asked = n_episodes  # that are still to be begun
+        self.playing = np.zeros(venv.num_envs, dtype=bool)
         self.actions = np.zeros(0)
         self.first: list[Any] = []  # observation of each row's episode under way
         self.steps: list[list[tuple[Any, ...]]] = []  # and its steps
 
     def reset(self) -> VecEnvObs:
         obs = self.venv.reset()
+        self.playing = np.arange(self.num_envs) < self.asked
+        self.asked = max(self.asked - self.num_envs, 0)
         self.first = [_row(obs, row) for row in range(self.num_envs)]
         self.steps = [[] for _ in self.first]
         return obs
@@ -78,7 +81,7 @@ class Recorder(VecEnvWrapper):
     def step_wait(self) -> VecEnvStepReturn:
         obs, rewards, dones, infos = self.venv.step_wait()
         ended = []
-        for row in np.flatnonzero(self.left).tolist():
+        for row in np.flatnonzero(self.playing).tolist():
             info, done = infos[row], bool(dones[row])
             truncated = done and info.get("TimeLimit.truncated", False)
             named = {key: number(info[key], key) for key in self.cost_keys if key in info}
@@ -88,8 +91,7 @@ class Recorder(VecEnvWrapper):
             self.steps[row].append(step)
             if done:
                 ended.append(_episode(self.first[row], self.steps[row]))
-                self.first[row], self.steps[row] = _row(obs, row), []
-                self.left[row] -= 1
+                self.playing[row] = False
         if ended:
             self.write(ended)
         if self.stop:
@@ -268,11 +270,13 @@ def recording(agent: Any, flags: EnjoyFlags, n_episodes: int) -> Iterator[None]:
             raise UsageError(f"--dataset needs {package}: pip install 'sb3-guard[datasets]'")
     model, monitor, certificate = agent.model, find_monitor(agent.env), agent.certificate
     keys = cost_keys_of(model, agent.env)
-    limited = [bounded_name(key, getattr(model, "limit_on", "sum")) for key in keys]
+    limits = Limits.of(model, keys)
     about = {
         "algorithm_name": flags.algo,
         "actions": "sampled" if agent.stochastic else "most likely",
-        "cost_limits": dict(zip(limited, limits_on(model, keys), strict=False)),
+        "cost_limits": dict(zip(limits.names, limits.values.tolist(), strict=True))
+        if limits
+        else {},
         "certificate": certificate and json.loads(certificate.to_json()),
         "command": shlex.join(["sb3-guard", "enjoy", *flags.words(flags.names())]),
     }

@@ -257,7 +257,7 @@ class DeliveryCallback(CostEvalCallback):
                 return f"Delivered, the policy of {steps:,} steps: {certificate}"
             refused.append(certificate)
         if not refused:
-            raise ValueError("no episode of a candidate has ended")
+            raise ValueError("no candidate's episodes came to an end, with costs that are known")
         nearest = min(refused, key=lambda one: one.nearest.upper - one.nearest.limit)
         return f"Nothing is delivered. The nearest candidate: {nearest}; {HELP}"
 

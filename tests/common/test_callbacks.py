@@ -19,6 +19,7 @@ from sb3_guard.common import callbacks
 from sb3_guard.common.callbacks import CostEvalCallback
 from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.common.monitor import CostMonitor
+from sb3_guard.judging import Limits
 
 
 def envs(n: int = 2, **kwargs) -> CostMonitor:
@@ -36,12 +37,16 @@ def evaluation(mean_return: float, *costs: float) -> Evaluation:
     """Two episodes around given means, one cost per key."""
     returns = np.array([mean_return - 1, mean_return + 1])
     key_costs = np.array([costs, costs])
-    return Evaluation(returns, key_costs[:, 0], np.array([10, 10]), key_costs)
+    lengths, limits = np.array([10, 10]), Limits(np.full(len(costs), np.inf))
+    return Evaluation(returns, key_costs[:, 0], lengths, key_costs, key_costs, limits)
 
 
 def callback(selection_limit=None, **model) -> CostEvalCallback:
     result = CostEvalCallback(envs(1), selection_limit=selection_limit)
-    result.model = SimpleNamespace(**model)
+    keys = model.setdefault("cost_keys", ("cost",))
+    model.setdefault("constrained", "cost_limit" in model)
+    limits = np.broadcast_to(model.get("cost_limit", np.inf), len(keys))
+    result.model = SimpleNamespace(final_cost_limits=limits, **model)
     return result
 
 
@@ -70,14 +75,15 @@ def test_safe_first_then_good(limit, candidates, best):
 def test_safe_is_what_keeps_the_limit_by_a_standard_error(limit, score):
     """Costs of 4, 5, 6 and 7: 5.5 on the average, with a standard error of 0.6455."""
     costs = np.array([[4.0], [5.0], [6.0], [7.0]])
-    seen = Evaluation(np.full(4, 3.0), costs[:, 0], np.full(4, 10), costs)
+    limits = Limits(np.array([np.inf]))
+    seen = Evaluation(np.full(4, 3.0), costs[:, 0], np.full(4, 10), costs, costs, limits)
     safe, value = callback(limit).score(seen)
     assert safe == score[0] and value == pytest.approx(score[1], abs=1e-4)
 
 
 def test_several_costs_each_have_their_limit():
     judge = callback(cost_limit=[0.0, 20.0], cost_keys=("a", "b"))
-    assert judge.limits().tolist() == [1.0, 20.0]
+    assert judge.limits().values.tolist() == [1.0, 20.0]
     assert judge.score(evaluation(7.0, 0.5, 19.0)) == (True, 7.0)
     # The violations add up.
     assert judge.score(evaluation(7.0, 2.0, 23.0)) == (False, -4.0)
@@ -191,7 +197,8 @@ def test_logs_the_costs(tmp_path, capsys):
         cost, heat = (row[f"eval/{name}_ep_cost/{key}"] for key in keys)
         assert cost > 0 and row[f"eval/{name}_ep_cost"] == pytest.approx(cost)
         assert heat == pytest.approx(2 * cost)
-    assert f"with noise cost {cost:.2f}, heat {heat:.2f}" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "; sampled actions: return " in told and f", heat {heat:.3f} ± " in told
     assert row["eval/mean_ep_cost"] == watcher.last_mean_cost > 0
     assert row["time/total_timesteps"] == 30
     costs = np.load(tmp_path / "evaluations.npz")["key_costs"]
@@ -214,7 +221,7 @@ def test_the_one_cost_that_is_limited_is_the_one_shown(tmp_path, capsys):
     assert total == pytest.approx(2 * heat) and heat > 0
     assert rows[0]["eval/mean_ep_cost"] == watcher.last_mean_cost == heat
     assert np.load(tmp_path / "evaluations.npz")["costs"].mean() == pytest.approx(heat)
-    assert f"heat {heat:.2f} ± " in capsys.readouterr().out
+    assert f"heat {heat:.3f} ± " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("deterministic", [True, False])

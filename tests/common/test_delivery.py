@@ -3,6 +3,7 @@
 import re
 import shutil
 from contextlib import ExitStack
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -14,7 +15,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_guard import CPO, TD3Lag, evaluate_policy, make_vec_env
 from sb3_guard.common.certificate import Certificate, agent_hash, certify
-from sb3_guard.common.delivery import DeliveryCallback
+from sb3_guard.common.delivery import DeliveryCallback, _played
+from sb3_guard.judging import Limits
 
 
 class Dose(gym.Env):
@@ -38,20 +40,20 @@ def envs(normalize=True):
     return VecNormalize(env, norm_reward=False) if normalize else env
 
 
-def trained(folder, limit, seed=0, eval_env=None, done=0, **kwargs):
+def trained(folder, limit, seed=0, eval_env=None, done=0, deliver=(), **kwargs):
     model = CPO("MlpPolicy", envs(), n_steps=10, cost_limit=1.0, seed=seed, device="cpu", **kwargs)
     model.n_critic_updates = 5
     if eval_env is None:
         eval_env = envs()
         eval_env.training = False
-    deliver = DeliveryCallback(eval_env, folder, limit, candidates=3, screening=20, verbose=1)
+    deliver = DeliveryCallback(eval_env, folder, limit, n_eval_episodes=20, **dict(deliver))
     model.num_timesteps = done
     model.learn(600 - done, callback=deliver, reset_num_timesteps=not done)
     return model, deliver
 
 
 def kept(folder):
-    files = sorted((folder / "candidates").glob("*.pt"))
+    files = sorted((folder / "candidates").glob("*.pt"), key=lambda file: int(file.stem))
     return [th.load(file, weights_only=True) for file in files]
 
 
@@ -73,12 +75,43 @@ def test_the_first_candidate_that_is_certified_is_delivered(delivered):
     assert agent_hash(agent, env) == certificate.agent
     assert certify(agent, env, 1.6, seed=99).verdict == "certified"
     # The model is as training left it.
-    last, weights = kept(folder)[-1]["policy"], model.policy.state_dict()
-    assert all(th.equal(value, weights[name]) for name, value in last.items())
+    alone = CPO("MlpPolicy", envs(), n_steps=10, cost_limit=1.0, seed=0, device="cpu")
+    alone.n_critic_updates = 5
+    alone.learn(600)
+    others = alone.policy.state_dict()
+    assert all(th.equal(value, others[name]) for name, value in model.policy.state_dict().items())
 
 
-def test_candidates_are_of_the_last_half_in_equal_parts(delivered):
-    assert [candidate["num_timesteps"] for candidate in kept(delivered[0])] == [300, 500, 600]
+STEPS = [300, 360, 420, 480, 540, 600]  # ten evaluations, from the middle of the training on
+
+
+def test_candidates_are_what_evaluations_of_the_last_half_have_played(delivered):
+    folder, model, deliver = delivered
+    assert [candidate["num_timesteps"] for candidate in kept(folder)] == STEPS
+    assert deliver.evaluations_timesteps == [60, 120, 180, 240, *STEPS]
+    for candidate, costs in zip(kept(folder), deliver.evaluations_costs[-6:], strict=True):
+        mean_return, seen = candidate["played"][True]
+        assert seen[:, 0].tolist() == costs  # each episode is played once
+    assert {*deliver.final} == {True, False} and len(deliver.final[True]) == 100
+
+
+def test_no_more_candidates_are_kept_than_may_be_tried(tmp_path):
+    """The best ones by the number that the best model is chosen by."""
+    _, deliver = trained(tmp_path, 1.6, deliver={"eval_freq": 2})
+    assert len(deliver.evaluations_timesteps) == 30 and len(kept(tmp_path)) == 8
+    limits = Limits(np.array([1.6]))
+    ranks = [max(one.rank(limits, 1.0) for one in _played(c)) for c in kept(tmp_path)]
+    worst = min(returns for safe, returns in ranks if safe)
+    for steps, returns, costs in zip(
+        deliver.evaluations_timesteps,
+        deliver.evaluations_results,
+        deliver.evaluations_costs,
+        strict=True,
+    ):
+        if steps >= 300 and (limits.excess(np.array(costs)[:, None]) <= 0.0).all():
+            assert np.mean(returns) <= worst or steps in [
+                c["num_timesteps"] for c in kept(tmp_path)
+            ]
 
 
 def test_nothing_is_delivered_where_nothing_keeps_the_limit(tmp_path, capsys, monkeypatch):
@@ -101,25 +134,25 @@ def test_nothing_is_delivered_where_nothing_keeps_the_limit(tmp_path, capsys, mo
 
 def test_a_training_that_continues_keeps_the_candidates_that_it_has(delivered, tmp_path):
     """Not those of a shorter training, nor those that it has not come to again."""
-    first, _, last = kept(delivered[0])
+    first, *_, last = kept(delivered[0])
     (tmp_path / "candidates").mkdir()
-    for number, candidate, steps in ((0, last, 300), (1, last, 550), (2, first, 200)):
+    for candidate, steps in ((last, 300), (last, 550), (first, 460)):
         there = {**candidate, "num_timesteps": steps}
-        th.save(there, tmp_path / "candidates" / f"{number:03d}.pt")
+        th.save(there, tmp_path / "candidates" / f"{steps}.pt")
     trained(tmp_path, 1.6, done=400)
     after = kept(tmp_path)
-    assert [candidate["num_timesteps"] for candidate in after] == [300, 500, 600]
+    assert [candidate["num_timesteps"] for candidate in after] == [300, 420, 480, 540, 600]
 
     def same(one, other):
         return all(th.equal(value, other["policy"][name]) for name, value in one["policy"].items())
 
-    assert same(after[0], last) and not same(after[1], last) and not same(after[2], first)
+    assert same(after[0], last)
 
 
 def test_another_training_in_the_folder_has_nothing_of_the_first(delivered, tmp_path, capsys):
     shutil.copytree(delivered[0], tmp_path, dirs_exist_ok=True)
     _, deliver = trained(tmp_path, -1.0, seed=1, policy_kwargs={"net_arch": [8]})
-    assert [candidate["num_timesteps"] for candidate in kept(tmp_path)] == [300, 500, 600]
+    assert [candidate["num_timesteps"] for candidate in kept(tmp_path)] == STEPS
     assert "Nothing is delivered" in capsys.readouterr().out
     assert deliver.certificate is None and not [*tmp_path.glob("certifi*")]
 
@@ -128,15 +161,13 @@ def test_a_callback_delivers_each_training_and_leaves_the_model_and_its_statisti
     env = envs()
     model, deliver = trained(tmp_path, 1.6, eval_env=env)  # one of its own keeps them, too
     first = [candidate["policy"] for candidate in kept(tmp_path)]
-    model.set_env(env)
+    weights = {name: value.clone() for name, value in model.policy.state_dict().items()}
     model.learn(600, callback=deliver)
-    assert [candidate["num_timesteps"] for candidate in kept(tmp_path)] == [300, 500, 600]
+    assert [candidate["num_timesteps"] for candidate in kept(tmp_path)] == STEPS
     for before, after in zip(first, kept(tmp_path), strict=True):
         assert any(not th.equal(value, after["policy"][name]) for name, value in before.items())
-    last = kept(tmp_path)[-1]
-    np.testing.assert_array_equal(env.obs_rms.mean, last["statistics"][""][0])
-    weights = model.policy.state_dict()
-    assert all(th.equal(value, weights[name]) for name, value in last["policy"].items())
+    np.testing.assert_array_equal(env.obs_rms.mean, model.get_env().obs_rms.mean)
+    assert any(not th.equal(value, weights[k]) for k, value in model.policy.state_dict().items())
 
 
 def files_of(folder):
@@ -256,7 +287,7 @@ def test_actions_that_are_sampled_alike_or_not_exported_are_not_tried(
     model, eval_env = restless(algorithm, env, **kwargs)
     deliver = DeliveryCallback(eval_env, tmp_path)
     deliver.init_callback(model)
-    assert deliver._kinds() == [True]
+    assert deliver.kinds() == [True]
 
 
 @pytest.mark.parametrize(
@@ -268,49 +299,35 @@ def test_actions_that_are_sampled_alike_or_not_exported_are_not_tried(
         ({}, "5 s5 4"),
     ],
 )
-def test_three_tries_the_best_first_then_more_cautious(screened, tried, tmp_path, monkeypatch):
-    model, env = restless()
-    deliver = DeliveryCallback(env, tmp_path)
-    deliver.init_callback(model)
+def test_three_tries_the_best_first_then_more_cautious(screened, tried):
+    """Costs 100 of which 99 are equal: the error is a hundredth of the other's distance."""
 
-    def screen(steps, deterministic, limits):
+    def played(steps, deterministic):
         name = "s" * (not deterministic) + str(steps)
         above = 2.0 - steps / 10 + 0.01 * (not deterministic)
         mean_return, excess = screened.get(name, (99.0, above))
-        return mean_return, np.array([-9.0, excess]), np.array([0.1, 0.1])
+        noise = np.tile([-1.0, 1.0], 50)
+        noise *= 1.0 / noise.std(ddof=1)  # a standard error of 0.1
+        return mean_return, th.from_numpy(np.stack([np.full(100, -9.0), 1.0 + excess + noise], 1))
 
-    monkeypatch.setattr(deliver, "_screen", screen)
-    tries = deliver._tries({steps: steps for steps in range(6)}, np.ones(1))
-    assert " ".join("s" * (not most_likely) + str(steps) for steps, most_likely in tries) == tried
-
-
-class TwoCosts(Dose):
-    action_space = spaces.Box(-5, 5, (1,), np.float32)
-
-    def step(self, action):
-        observation, reward, ended, cut, info = super().step(action)
-        return observation, reward, ended, cut, {"cost": 2.0 - info["cost"], "dose": abs(reward)}
+    contents = [
+        {"num_timesteps": steps, "played": {kind: played(steps, kind) for kind in (True, False)}}
+        for steps in range(6)
+    ]
+    tries = DeliveryCallback._tries(contents, Limits(np.ones(2), ("a", "b")))
+    names = ["s" * (not one.deterministic) + str(one.content["num_timesteps"]) for one in tries]
+    assert " ".join(names) == tried
 
 
-def test_the_screening_of_several_costs(tmp_path, monkeypatch):
-    keys = {"cost_keys": ("cost", "dose")}
-    env = make_vec_env(TwoCosts, n_envs=5, monitor_kwargs=keys)
-    model = CPO("MlpPolicy", env, cost_limit=[1.0, 4.0], seed=0, **keys)
-    deliver = DeliveryCallback(env, tmp_path, screening=20)
+def test_episodes_that_did_not_end_or_broke_the_simulation_are_of_no_candidate(tmp_path):
+    model, env = restless()
+    deliver = DeliveryCallback(env, tmp_path)
     deliver.init_callback(model)
-    candidate = deliver._policy()
-    for deterministic in True, False:
-        th.manual_seed(0)
-        played = evaluate_policy(model, env, 20, deterministic, seed=deliver.seed)
-        th.manual_seed(0)
-        mean_return, excess, error = deliver._screen(candidate, deterministic, np.array([1.0, 4.0]))
-        assert mean_return == pytest.approx(played.returns.mean())
-        assert excess == pytest.approx(played.limited.mean(axis=0) - [1.0, 4.0])
-        assert error == pytest.approx(played.limited.std(axis=0, ddof=1) / 20**0.5)
-    # Episodes without an end, or that ended in a physics error: only a first try, for a verdict
-    played.limited[3, 1] = np.nan
-    monkeypatch.setattr("sb3_guard.common.delivery.evaluate_policy", lambda *args, **kwargs: played)
-    assert list(deliver._tries({7: candidate}, np.array([1.0, 4.0]))) == [(7, True)]
+    seen = evaluate_policy(model, env, 20, seed=0)
+    assert [*deliver._content({True: seen})["played"]] == [True]
+    broken = replace(seen, key_costs=np.where(np.arange(20)[:, None] == 3, np.nan, 0.0))
+    unfinished = replace(seen, unfinished=np.zeros((1, 3)))
+    assert not deliver._content({True: broken, False: unfinished})["played"]
 
 
 class Endless(Dose):
@@ -325,7 +342,7 @@ def test_a_training_whose_agent_never_ends_an_episode_is_kept(tmp_path, capsys, 
     with pytest.warns(UserWarning, match="had not ended"):
         model, deliver = trained(tmp_path, 1.6, eval_env=eval_env)
     assert deliver.certificate is None and model.num_timesteps == 600
-    assert "Nothing is delivered: 100 of 100 episodes did not end" in capsys.readouterr().out
+    assert "Nothing is delivered: no candidate's episodes came to an end" in capsys.readouterr().out
 
 
 def test_an_absent_normaliser_is_told_before_the_training(tmp_path):

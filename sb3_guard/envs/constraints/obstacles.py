@@ -61,3 +61,14 @@ class Obstacles(Placed, Constraint):
         if self.indicator:
             return (amounts > 0).any(axis=1).astype(float)
         return amounts.sum(axis=1)
+
+    @property
+    def most_cost(self) -> float:  # type: ignore[override]
+        """A point's mean distance from m ≥ 2 centres, 2k apart, is ≥ k: Σ depths ≤ m (size − k)."""
+        most, thickness = float(self.num), self.sim.robot.thickness
+        if not self.solid:
+            most *= self.size + thickness
+            if self.movable == "no" and thickness == 0 and len(self.locations) < 2:
+                depths = self.num * (self.size - self.group.footprint.keepout)
+                most = min(most, max(self.size, depths))
+        return 1.0 if self.indicator else self.weight and self.weight * most

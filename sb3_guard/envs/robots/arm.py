@@ -31,6 +31,7 @@ class Arm(MJCFRobot):
         bodies = [model.body(PREFIX + link).id for link in self.links]
         self._links = as_slice(bodies)
         self._radii = model.geom_size[model.body_geomadr[bodies], 0][:, None, None]
+        self.thickness = float(self._radii.max())
 
     def clearance(self, points: Array, planar: bool) -> Array:
         """Distance of points from the surface of the nearest link, [N, K] m; negative inside."""
@@ -58,6 +59,7 @@ class FileArm(MJCFRobot):
         ends = np.zeros_like(half)
         ends[rows, longest] = half[rows, longest] - radii
         self._links, self._radii = geoms, radii[:, None, None]
+        self.thickness = float(self._radii.max())
         self._ends = middle - ends, middle + ends  # [L, 3] m each, in the geoms' frames
 
     def clearance(self, points: Array, planar: bool) -> Array:

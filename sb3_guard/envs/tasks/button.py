@@ -68,6 +68,7 @@ class Button(Placed, Task):
         super().bind(sim)
         self._flat = sim.robot.workspace == "planar"
         self._rows = np.arange(sim.num_envs)
+        self.most_mistakes = self.num - 1.0
         self.right = sim.array("button/right", dtype=np.int64)  # [N] which button is the right one
         # [N] how many steps ahead the first is that counts; 0 during one that does
         self.wait = sim.array("button/wait", dtype=np.int64)

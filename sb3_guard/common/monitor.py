@@ -219,7 +219,7 @@ def cost_keys_of(model: Any, env: VecEnv) -> tuple[str, ...]:
 
 
 def highest_costs(env: VecEnv) -> dict[str, float]:
-    """The highest cost of an episode, by entry of info: ``most_costs`` times the limit of its steps.
+    """The highest cost of an episode, by entry of info: ``most_costs`` times its limit of steps.
 
     It is inf without a limit, and {} of environments that do not state the highest cost of a step.
     """

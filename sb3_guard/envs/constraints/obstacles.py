@@ -1,6 +1,7 @@
 """The base of constraints with several alike objects: a cost for entering or touching them."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -20,6 +21,8 @@ class Obstacles(Placed, Constraint):
     the nearest link of an arm. Cost of solid ones, which have a :meth:`shape`: how many the robot
     touches when the control step ends, each counted once however many contact points it has.
     """
+
+    bounds: ClassVar[dict[str, str]] = {**Constraint.bounds, "amounts": "most_cost"}
 
     weight: float = param(1.0, "cost per metre of depth, or per object touched", low=0)
     indicator: bool = param(False, "cost 1 if there is any, instead of the sum")

@@ -1,9 +1,9 @@
 """Ship the best certified agents of the grand table: ``python scripts/pretrain.py logs/grand``.
 
 The runs below the folder are those that ``scripts/leaderboard.py --train`` writes. A run is
-a candidate if the mean cost of its final episodes plus two standard errors is within the limit, with
-sampled actions and with the most likely ones; of an environment's candidates that with the highest
-return is taken. With less than a tenth of the best run's return, of whatever cost, it
+a candidate if the mean cost of its final episodes plus two standard errors is within the limit,
+with sampled actions and with the most likely ones; of an environment's candidates that with the
+highest return is taken. With less than a tenth of the best run's return, of whatever cost, it
 hardly does its task and does not count. It is certified with each kind of actions, by fresh
 episodes, and shipped if it is; else the next one is tried. An agent that is
 shipped already is kept if its return is as high. Runs from a packed archive have no model:

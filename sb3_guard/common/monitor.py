@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+import math
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -214,3 +215,17 @@ def cost_keys_of(model: Any, env: VecEnv) -> tuple[str, ...]:
     if hasattr(model, "cost_keys"):
         return tuple(model.cost_keys)
     return find_monitor(env).cost_keys if is_vecenv_wrapped(env, CostMonitor) else ("cost",)
+
+
+def highest_costs(env: VecEnv) -> dict[str, float]:
+    """The highest cost of an episode, by entry of info: ``most_costs`` times its limit of steps.
+
+    It is inf without a limit, and {} of environments that do not state the highest cost of a step.
+    """
+    if not env.has_attr("most_costs") or getattr(env.unwrapped, "cost", None):  # another cost
+        return {}
+    names = [n for n in ("_max_episode_steps", "max_episode_steps") if env.has_attr(n)]
+    steps = max((limit for name in names for limit in env.get_attr(name)), default=math.inf)
+    stated = env.get_attr("most_costs")
+    highest = {key: max(most.get(key, 0.0) for most in stated) for key in stated[0]}
+    return {key: cost and cost * steps for key, cost in highest.items()}

@@ -1,5 +1,6 @@
 """One environment with Gymnasium's interface: the batch of one."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -146,6 +147,14 @@ class Simulated:
     def actuators(self) -> list[Actuator]:
         """What each number of an action moves: name, range, and range of the actuator."""
         return list(actuators(self.engine))
+
+    @property
+    def most_costs(self) -> dict[str, float]:
+        """The highest cost of a step, by entry of info; inf where nobody can say."""
+        parts, alone = self.engine.constraints, self.scenario.cost == "any"
+        most = {c.name: float(c.most_cost > 0) if alone else c.most_cost for c in parts}
+        total = min(sum(most.values(), 0.0), 1.0 if alone else math.inf)
+        return {"cost": total} | {f"cost_{n}": most[c.name] for c in parts for n in c.costs()}
 
     def look(self) -> Array | None:
         """What the robots' cameras see, [N, H, W, 3] uint8, or None if that is not observed."""

@@ -189,6 +189,14 @@ class Part(Parameters):
     solid: bool = False  # whether its objects are bodies that the robot bumps into
     color: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.5)
     family: ClassVar[str] = "guard"  # of suites; a part of GUARD's has a page of its own
+    bounds: ClassVar[dict[str, str]] = {}  # of the values of methods
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        for method, bound in cls.bounds.items():  # one who replaces a method states its bound anew
+            nearest = (vars(c) for c in cls.__mro__ if method in vars(c) or bound in vars(c))
+            if bound not in next(nearest, {bound}):
+                setattr(cls, bound, math.inf)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -307,6 +315,8 @@ class Robot(Part):
     # come first
     defaults: Mapping[str, Mapping[str, Any]] = {}
     altitude: float = 0.0  # m, z of its position when an episode begins
+    bounds: ClassVar[dict[str, str]] = {"clearance": "thickness"}
+    thickness: float = math.inf  # m, greatest depth of a point inside it; 0: the robot is a point
     action_size: int
     action_range: tuple[Array | float, Array | float] = (-1.0, 1.0)  # lowest and highest actions
 
@@ -376,6 +386,8 @@ class Task(Part):
     reward_limit: float | None = None  # dense rewards are cut off at ± this; None: they are not
     bonus: float = 0.0  # reward for success, added to the dense reward after that
     ends: bool = False  # whether success ends the episode instead of drawing a new goal
+    bounds: ClassVar[dict[str, str]] = {"mistakes": "most_mistakes"}
+    most_mistakes: float = 0.0  # the most that there can be at a time
     camera: ClassVar[str] = "fixed"  # of pictures that are not asked to have another one
     invalid_reason: ClassVar[str] = "its goal is reached immediately"  # why it is drawn again
 
@@ -409,6 +421,9 @@ class Constraint(Part):
 
     trespassable: bool  # the taxonomy of the paper's constraint table
     movable: str  # "no", "passive" or "active"
+    bounds: ClassVar[dict[str, str]] = {"cost": "most_cost", "costs": "most_cost"}
+    #: highest cost of a step; inf of a class that has a cost of its own and does not state it
+    most_cost: float = math.inf
 
     def cost(self) -> Array:
         """The cost of this step, [N], at least 0."""

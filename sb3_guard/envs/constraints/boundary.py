@@ -24,6 +24,7 @@ class Boundary(Constraint):
     movable = "no"
     spaces = ("planar",)
     color = (0.9, 0.7, 0.1)
+    most_cost = 1.0
 
     x: float | None = param(1.125, "farthest from the y axis, m; null: anywhere", low=0)
     y: float | None = param(None, "farthest from the x axis, m; null: anywhere", low=0)

@@ -38,3 +38,8 @@ class Buttons(Obstacles):
     def amounts(self) -> Array:
         own = super().amounts()
         return np.column_stack([own, self.weight * self.sim.task.mistakes()])
+
+    @property
+    def most_cost(self) -> float:  # type: ignore[override]
+        others = self.weight and self.weight * self.sim.task.most_mistakes
+        return super().most_cost + (0.0 if self.indicator else others)

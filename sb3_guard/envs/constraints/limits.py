@@ -35,6 +35,10 @@ class Limit(Constraint):
         """Whether it is beyond, [N] bool."""
         raise NotImplementedError
 
+    @property
+    def most_cost(self) -> float:  # type: ignore[override]
+        return self.weight
+
     def cost(self) -> Array:
         return self.weight * self.beyond()
 

@@ -1,6 +1,7 @@
 """The base of constraints with several alike objects: a cost for entering or touching them."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -20,6 +21,8 @@ class Obstacles(Placed, Constraint):
     the nearest link of an arm. Cost of solid ones, which have a :meth:`shape`: how many the robot
     touches when the control step ends, each counted once however many contact points it has.
     """
+
+    bounds: ClassVar[dict[str, str]] = {**Constraint.bounds, "amounts": "most_cost"}
 
     weight: float = param(1.0, "cost per metre of depth, or per object touched", low=0)
     indicator: bool = param(False, "cost 1 if there is any, instead of the sum")
@@ -61,3 +64,14 @@ class Obstacles(Placed, Constraint):
         if self.indicator:
             return (amounts > 0).any(axis=1).astype(float)
         return amounts.sum(axis=1)
+
+    @property
+    def most_cost(self) -> float:  # type: ignore[override]
+        """A point's mean distance from m ≥ 2 centres, 2k apart, is ≥ k: Σ depths ≤ m (size − k)."""
+        most, thickness = float(self.num), self.sim.robot.thickness
+        if not self.solid:
+            most *= self.size + thickness
+            if self.movable == "no" and thickness == 0 and len(self.locations) < 2:
+                depths = self.num * (self.size - self.group.footprint.keepout)
+                most = min(most, max(self.size, depths))
+        return 1.0 if self.indicator else self.weight and self.weight * most

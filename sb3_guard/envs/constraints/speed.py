@@ -21,6 +21,7 @@ class Speed(Constraint):
     trespassable = True
     movable = "no"
     color = (0.9, 0.2, 0.1)
+    most_cost = 1.0
 
     limit: float = param(1.0, "highest speed that is free, m/s", low=0)
     axes: str = param(

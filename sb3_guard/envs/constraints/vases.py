@@ -75,6 +75,13 @@ class Vases(Obstacles):
     def amounts(self) -> Array:
         return super().amounts() + self._moved() + self._moving()
 
+    @property
+    def most_cost(self) -> float:  # type: ignore[override]
+        boundless = self.displacement_weight or self.velocity_weight or self.indicator
+        return (
+            math.inf if boundless and (self.separate or not self.indicator) else super().most_cost
+        )
+
     def costs(self) -> dict[str, Array]:
         if not self.separate:
             return super().costs()

@@ -25,6 +25,7 @@ class Arm(MJCFRobot):
     integrator = "Euler"
     workspace = "spatial"
     reach = 2.0
+    thickness = 0.0
     links: ClassVar[tuple[str, ...]]
 
     def bind(self, sim: Simulation) -> None:
@@ -33,6 +34,7 @@ class Arm(MJCFRobot):
         bodies = [model.body(PREFIX + link).id for link in self.links]
         self._links = as_slice(bodies)
         self._radii = model.geom_size[model.body_geomadr[bodies], 0][:, None, None]
+        self.thickness = max(self.thickness, float(self._radii.max()))
 
     def clearance(self, points: Array, planar: bool) -> Array:
         """Distance of points from the surface of the nearest link, [N, K] m; negative inside."""
@@ -49,6 +51,7 @@ class Arm(MJCFRobot):
 class FileArm(MJCFRobot):
     """An arm of anybody's file: a link is the capsule around a geom that meets something."""
 
+    thickness = 0.0
     heading: float = param(0.0, "heading, rad")  # never random: not all arms turn all around
     near: ClassVar[tuple[str, ...]] = ("goal", "hazards", "ghosts")  # parts in its reach
     shoulder: ClassVar[Array]  # where its first joint is in the file, [3] m
@@ -76,6 +79,7 @@ class FileArm(MJCFRobot):
         ends = np.zeros_like(half)
         ends[rows, longest] = half[rows, longest] - radii
         self._links, self._radii = geoms, radii[:, None, None]
+        self.thickness = max(self.thickness, float(self._radii.max()))
         self._ends = middle - ends, middle + ends  # [L, 3] m each, in the geoms' frames
 
     def clearance(self, points: Array, planar: bool) -> Array:

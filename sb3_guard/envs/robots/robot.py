@@ -85,6 +85,7 @@ class MJCFRobot(Robot):
     floor: ClassVar[bool] = True  # False: it slides at a fixed height and never meets the floor
     complete: ClassVar[bool] = False  # whether the file is a world with a floor of its own
     aware: ClassVar[bool] = False  # whether it observes what no sensor of the file measures
+    thickness = 0.0
     tip: ClassVar[str | None] = None  # the site at its position; None: the body ``center``
 
     name = "robot"

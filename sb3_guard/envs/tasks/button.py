@@ -35,6 +35,7 @@ class Button(Placed, Task):
     solid = True
     usual_keepout = 0.3
     reachable = True
+    most_mistakes = 0.0
 
     num: int = param(4, "number of buttons", low=1, high=MOST)
     size: float = param(0.1, "radius of a button, m", above=0)
@@ -68,6 +69,7 @@ class Button(Placed, Task):
         super().bind(sim)
         self._flat = sim.robot.workspace == "planar"
         self._rows = np.arange(sim.num_envs)
+        self.most_mistakes = max(self.most_mistakes, self.num - 1.0)
         self.right = sim.array("button/right", dtype=np.int64)  # [N] which button is the right one
         # [N] how many steps ahead the first is that counts; 0 during one that does
         self.wait = sim.array("button/wait", dtype=np.int64)

@@ -4,6 +4,7 @@
 another name.
 """
 
+import math
 import sys
 from contextlib import closing
 from pathlib import Path
@@ -16,15 +17,22 @@ def certify_agent(flags: Flags) -> int:
     """Play an agent's fresh episodes and print what they show; 0 if it is certified, else 1."""
     from sb3_guard.common.certificate import certify
     from sb3_guard.common.files import replacing
+    from sb3_guard.common.monitor import highest_costs
     from sb3_guard.judging import EPISODES
-    from sb3_guard.zoo.agents.playback import BATCH, open_agent
-    from sb3_guard.zoo.cli.usage import explained
+    from sb3_guard.zoo.agents.playback import open_agent
+    from sb3_guard.zoo.cli.usage import UsageError, explained
     from sb3_guard.zoo.run.make_envs import BAD_NUMBERS
+    from sb3_guard.zoo.run.run import CERTIFICATE_ENVS
 
     if flags.json:
         Path(flags.json).parent.mkdir(parents=True, exist_ok=True)
-    agent = open_agent(flags, None, BATCH)
-    limits = flags.cost_limit
+    agent = open_agent(flags, None, CERTIFICATE_ENVS)
+    limits, most = flags.cost_limit, flags.most
+    if flags.exact:
+        limit_on = getattr(agent.model, "limit_on", "sum")
+        most = max(highest_costs(agent.env, limit_on).values(), default=math.inf)
+        if math.isinf(most):
+            raise UsageError(f"{agent.env_id} does not state its highest cost; give it with --most")
     with closing(agent.env), explained(f"can't certify {agent.path}", ValueError, *BAD_NUMBERS):
         certificate = certify(
             agent.model,
@@ -33,6 +41,7 @@ def certify_agent(flags: Flags) -> int:
             n_episodes=flags.n_episodes or EPISODES,
             deterministic=not agent.stochastic,
             seed=flags.seed,
+            most=most,
         )
     print(f"{agent.path} on {agent.env_id}")
     print(certificate)

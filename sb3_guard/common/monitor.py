@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 from sb3_guard.checks import NumberError, check_cost_keys
 from sb3_guard.common.vec_budgets import end_rows
 from sb3_guard.costs import EpisodeCost, EpisodeCosts, number, read_costs
-from sb3_guard.vector import layers
+from sb3_guard.vector import layers, step_limits
 
 
 def total_cost(info: Mapping[str, Any], cost_keys: Sequence[str] = ("cost",)) -> float:
@@ -217,15 +217,16 @@ def cost_keys_of(model: Any, env: VecEnv) -> tuple[str, ...]:
     return find_monitor(env).cost_keys if is_vecenv_wrapped(env, CostMonitor) else ("cost",)
 
 
-def highest_costs(env: VecEnv) -> dict[str, float]:
-    """The highest cost of an episode, by entry of info: ``most_costs`` times its limit of steps.
+def highest_costs(env: VecEnv, limit_on: str = "sum") -> dict[str, float]:
+    """
+    The highest cost of an episode that the environment states, by entry of info.
 
-    It is inf without a limit, and {} of environments that do not state the highest cost of a step.
+    :param limit_on: ``"sum"`` of an episode's costs, or ``"max"``, the highest one of a step
+    :return: infinite without a limit of steps; empty where nothing is stated
     """
     if not env.has_attr("most_costs") or getattr(env.unwrapped, "cost", None):  # another cost
         return {}
-    names = [n for n in ("_max_episode_steps", "max_episode_steps") if env.has_attr(n)]
-    steps = max((limit for name in names for limit in env.get_attr(name)), default=math.inf)
+    steps = 1.0 if limit_on == "max" else max(step_limits(env), default=math.inf)
     stated = env.get_attr("most_costs")
     highest = {key: max(most.get(key, 0.0) for most in stated) for key in stated[0]}
     return {key: cost and cost * steps for key, cost in highest.items()}

@@ -103,13 +103,17 @@ class CertifyFlags(AgentFlags):
     """
     Say whether a trained agent's mean episode cost is within its limit, by fresh episodes.
 
-    After 400 episodes an upper 95 % confidence bound of the mean is compared with the limit. The
-    status is 0 if the agent is certified, else 1.
+    After 600 episodes an upper 95 % confidence bound of the mean is compared with the limit; where
+    more would decide, up to four times as many are played. The status is 0 if the agent is
+    certified, else 1.
 
     What is played:
 
-    :param n_episodes: most episodes to play, at least 100 (default: 400)
+    :param n_episodes: episodes after which the agent may be certified, at least 100 (default: 600)
     :param cost_limit: limit of an episode's cost, or one for each cost (default: the agent's own)
+    :param most: highest possible cost of an episode: the bounds are exact, and need some
+        3 most / (limit - mean) episodes
+    :param exact: the same with the highest cost that the environment states
 
     Output:
 
@@ -124,6 +128,8 @@ class CertifyFlags(AgentFlags):
 """
     n_episodes: int | None = flag(low=1, metavar="N")
     cost_limit: list[float] = flag(default=[], metavar="D")
+    most: float | None = flag(low=0, metavar="B", exclusive="most")
+    exact: bool = flag(default=False, exclusive="most")
     json: str | None = flag(metavar="FILE")
 
 

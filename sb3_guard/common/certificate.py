@@ -211,25 +211,17 @@ class Certificate:
 
     @classmethod
     def from_json(cls, text: str) -> "Certificate":
-        """
-        The certificate that :meth:`to_json` wrote.
+        """The certificate that :meth:`to_json` wrote; raises ValueError for another text."""
 
-        :raises ValueError: the text is another, or damaged
-        """
-
-        def read(kind: type, content: Any) -> Any:
-            names = {entry.name: entry.type for entry in fields(kind)}
-            return kind(**{name: fit(name, content[name], names[name]) for name in names})
+        def values(kind: Any, content: Any) -> dict[str, Any]:
+            return {it.name: fit(it.name, content[it.name], it.type) for it in fields(kind)}
 
         try:
             content = json.loads(text)
-            costs = {name: read(CostBound, cost) for name, cost in content["costs"].items()}
-            if not costs:
-                raise ValueError("there is no cost")
-            certificate: Certificate = read(cls, {**content, "costs": costs})
-            return certificate
+            costs = {key: CostBound(**values(CostBound, c)) for key, c in content["costs"].items()}
+            return cls(**values(cls, {**content, "costs": costs or None}))
         except (TypeError, KeyError, AttributeError) as error:
-            raise ValueError(f"not of a certificate: {error!r}") from None
+            raise ValueError(f"this is no certificate: {error!r}") from None
 
 
 def agent_hash(model: Any, env: VecEnv) -> str:

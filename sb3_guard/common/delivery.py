@@ -39,6 +39,7 @@ HELP = (
 CERTIFICATE = "certificate.json"
 MODEL, NORMALIZER = "certified_model.zip", "certified_model_vecnormalize.pkl"
 CANDIDATE = {"num_timesteps", "policy", "statistics"}  # the entries of its file
+Candidates = Mapping[int, dict[str, Any]]  # what is in their files, by their steps
 TRIES = 3  # of candidates, with one kind of actions or the other; they share the error
 
 
@@ -106,9 +107,7 @@ class DeliveryCallback(BaseCallback):
         sync_normalization(self.training_env, self.eval_env)
         check_agent(self.model, self.eval_env)
         if (file := self.folder / CERTIFICATE).exists() and not (self.folder / MODEL).exists():
-            raise FileExistsError(
-                f"{file} is not of this callback, which would replace it; choose another folder"
-            )
+            raise FileExistsError(f"{file} would be replaced; move it, or choose another folder")
         (self.folder / "candidates").mkdir(parents=True, exist_ok=True)
 
     def _limits(self) -> list[float]:
@@ -126,9 +125,8 @@ class DeliveryCallback(BaseCallback):
         return True
 
     def _on_rollout_start(self) -> None:
-        file = self._candidate(self.num_timesteps)
-        if 2 * self.num_timesteps >= self.model._total_timesteps and not file.exists():
-            self._keep(file)
+        if 2 * self.num_timesteps >= self.model._total_timesteps:
+            self._keep()
 
     def _kept(self) -> Iterator[tuple[Path, dict[str, Any]]]:
         """Files of candidates, and what is in them; not what is damaged, or was put there."""
@@ -145,13 +143,9 @@ class DeliveryCallback(BaseCallback):
         part = math.floor(share * (self.candidates - 1))
         return self.folder / "candidates" / f"{part:03d}.pt"
 
-    def _keep(self, file: Path) -> None:
-        with replacing(file) as written:
-            th.save(self._policy(), written)
-
-    def _policy(self) -> dict[str, Any]:
-        """The policy as it is now, with its observation statistics."""
-        return {
+    def _keep(self) -> dict[str, Any]:
+        """The policy as it is, which its file gets if there is no such file yet."""
+        content = {
             "num_timesteps": self.num_timesteps,
             "policy": self.model.policy.state_dict(),
             "statistics": {
@@ -159,13 +153,15 @@ class DeliveryCallback(BaseCallback):
                 for name, part in moments_of(self.training_env).items()
             },
         }
+        if not (file := self._candidate(self.num_timesteps)).exists():
+            with replacing(file) as written:
+                th.save(content, written)
+        return content
 
     def _on_training_end(self) -> None:
         if self.num_timesteps < self.model._total_timesteps:  # stopped before
             return
-        if not (last := self._candidate(self.num_timesteps)).exists():
-            self._keep(last)
-        trained = copy.deepcopy(self._policy())
+        trained = copy.deepcopy(self._keep())
         kept = {candidate["num_timesteps"]: candidate for _, candidate in self._kept()}
         began = time.process_time()
         try:
@@ -185,8 +181,8 @@ class DeliveryCallback(BaseCallback):
         for name in (CERTIFICATE, NORMALIZER, MODEL):  # without the first they are not taken
             (self.folder / name).unlink(missing_ok=True)
 
-    def _deliver(self, candidates: Mapping[int, dict[str, Any]]) -> str:
-        """Certify the best of the candidates, by their steps; what to say of it."""
+    def _deliver(self, candidates: Candidates) -> str:
+        """Certify the best candidate; what to say of it."""
         limits = self._limits()
         refused: list[Certificate] = []
         for steps, deterministic in self._tries(candidates, np.array(limits)):
@@ -207,12 +203,9 @@ class DeliveryCallback(BaseCallback):
         nearest = min(refused, key=lambda certificate: certificate.nearest.excess)
         return f"Nothing is delivered. The nearest candidate: {nearest}; {HELP}"
 
-    def _tries(
-        self, candidates: Mapping[int, dict[str, Any]], limits: np.ndarray
-    ) -> Iterator[tuple[int, bool]]:
+    def _tries(self, candidates: Candidates, limits: np.ndarray) -> Iterator[tuple[int, bool]]:
         """
-        Steps of the candidates in the order in which they are tried, and whether with their most
-        likely actions.
+        Candidates in the order in which they are tried, and whether with their most likely actions.
 
         First the one of highest return whose mean cost plus its standard error is within the limit;
         after a refusal plus twice that, then three times. If none is, the nearest.
@@ -274,8 +267,7 @@ class DeliveryCallback(BaseCallback):
         self.model.num_timesteps = trained
         contents[MODEL] = model.getvalue()
         with ExitStack() as files:
-            # Until all are written the earlier agent stays. Then the files take their names, in
-            # reverse: the certificate, which vouches for the others, is the last one.
+            # Once all are written they take their names, the certificate as the last one.
             for name, content in contents.items():
                 file = files.enter_context(replacing(self.folder / name))
                 file.write(content)

@@ -281,7 +281,7 @@ def certify(
         are others, one whose mean is above the limit at a look is not looked at again
     :raises ValueError: the limit is no finite number, there are too few episodes, no step reports
         a cost, the normalisation of the model's observations is absent, or a wrapper of ``env`` is
-        for training only, as ``VecEarlyTermination``
+        for training only, as ``VecEarlyTermination`` and Gymnasium's ``NormalizeReward``
     """
     fit("n_episodes", n_episodes, int, LEAST, ends="[)")
     fit("tries", tries, int, 1, ends="[)")

@@ -268,8 +268,8 @@ def evaluate_policy(
     Each row of a vectorised environment plays its own share of the episodes, fixed beforehand. To
     take the first ones that end, from any row, would favour short episodes.
 
-    Returns and lengths are those of a monitor wrapper where there is one, so that reward
-    normalisation outside it does not show. Costs are read as the model reads them in training,
+    Returns and lengths are those of a monitor wrapper where there is one, else sums of the rewards
+    before ``VecNormalize``. Costs are read as the model reads them in training,
     with its ``missing_cost``; if it has none, as a policy or PPO, an absent cost counts as 0.
 
     A policy that corrects its actions by the cost of the last step has a true attribute

@@ -68,8 +68,8 @@ def export(
         of the keyframe ``stop``, else position servos hold and motors and velocity servos have 0
     :param trained: what the contract shall say of the training, plain data
     :return: the contract
-    :raises ValueError: the agent is of a kind that can't be exported, or has no environment, or
-        another agent is in the folder
+    :raises ValueError: the agent is of a kind that can't be exported, or has no environment with
+        its observation statistics, or another agent is in the folder
     :raises ImportError: the extra ``export`` is not installed
     """
     path = Path(path)

@@ -371,7 +371,7 @@ class TensorVecEnv(BatchVecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """
-        :raises ContractError: not five values, or cost, time-outs or last observations not of N rows
+        :raises ContractError: not five values, or cost, time-outs, last observations not of N rows
         """
         actions = th.as_tensor(self._actions, dtype=th.float32, device=self.device)
         step = self.envs.step(actions)

@@ -293,7 +293,9 @@ def test_a_run_closes_processes_whose_answers_are_lost(forked):
     run.env.step_async(np.zeros((2, 2), np.float32))
     run.env.unwrapped.remotes[0].recv()
     run.close()
-    assert not multiprocessing.active_children()
+    for process in run.env.unwrapped.processes:
+        process.join(10)
+        assert not process.is_alive()
 
 
 def in_processes(num_envs: int = 1, **kwargs: Any) -> AsyncVectorEnv:

@@ -292,7 +292,7 @@ class Run:
         others = [callback.eval_env for callback in (self.evaluation, self.delivery) if callback]
         for env in (self.env, *others):
             if getattr(env.unwrapped, "waiting", False):  # SubprocVecEnv, for answers that are lost
-                for process in env.unwrapped.processes:
+                for process in getattr(env.unwrapped, "processes", ()):
                     process.terminate()
             with suppress(*PROCESS_DIED):
                 env.close()

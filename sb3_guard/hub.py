@@ -16,12 +16,11 @@ from sb3_guard.common.certificate import Certificate
 from sb3_guard.judging import Mean
 from sb3_guard.zoo.cli.flags import Command, command, flag
 from sb3_guard.zoo.cli.usage import UsageError, explained, packages_flag
-from sb3_guard.zoo.run.folder import PLAYED, RunFolder, is_run
+from sb3_guard.zoo.run.folder import PLAYED, RunFolder
 from sb3_guard.zoo.run.progress import summary
 
 # Flags that name files of this machine
 PATHS = ("log_folder", "tensorboard_log", "conf_file", "trained_agent")
-PAGE = "README.md"
 CARD = """---
 library_name: stable-baselines3
 tags: [{env}, reinforcement-learning, safe-reinforcement-learning, stable-baselines3, sb3-guard]
@@ -69,38 +68,24 @@ class Flags(Command):
 
 
 def uploaded(run: RunFolder) -> list[Path]:
-    """Settings, models, their certificate and the training episodes: those of them that there are.
-
-    :raises UsageError: one is a link to a file that is not the run's
-    """
-    settings = [run.params / name for name in ("args.yml", "config.yml", "command.txt")]
-    agents = [*run.path.glob("best_model*"), *run.path.glob("certifi*")]
-    paths = [*settings, run.model, run.normalizer, run.monitor, *agents]
+    """The files of a run that are given away; raises UsageError for a link that leaves the run."""
+    paths = [run.params / name for name in ("args.yml", "config.yml", "command.txt")]
+    paths += [run.model, run.normalizer, run.monitor]
+    paths += [*run.path.glob("best_model*"), *run.path.glob("certifi*")]
     for path in paths:
         if not path.resolve().is_relative_to(run.path.resolve()):
-            raise UsageError(
-                f"{path} is a link that leaves the run folder; replace it with the file, if that "
-                "may be uploaded"
-            )
+            raise UsageError(f"{path} is a link that leaves the run folder; replace it by the file")
     return [path for path in paths if path.is_file()]
 
 
 def empty(folder: Path) -> None:
-    """
-    Remove the agent that was written into a folder before; hidden files stay.
-
-    :raises UsageError: the folder holds anything else
-    """
+    """Remove the agent that was written there before; raises UsageError if anything else is."""
     there = {path for top in folder.glob("[!.]*") for path in (top, *top.glob("*"))}
-    page = folder / PAGE
-    if page.is_file() and b"sb3_guard" in page.read_bytes() and is_run(folder):
+    if (card := folder / "README.md").is_file() and b"sb3_guard" in card.read_bytes():
         before = RunFolder(folder)
-        there -= {page, before.params, *uploaded(before)}
+        there -= {card, before.params, *uploaded(before)}
     if there:
-        raise UsageError(
-            f"{folder} holds {min(there).relative_to(folder)}, which this command has not written; "
-            "name an empty folder with -o"
-        )
+        raise UsageError(f"{folder} holds files of others, {min(there)}; name an empty one with -o")
     for path in folder.glob("[!.]*"):
         shutil.rmtree(path) if path.is_dir() else path.unlink()
 
@@ -109,10 +94,9 @@ def hub(flags: Flags) -> int:
     """Write the run's models, their certificate, and a card."""
     run, folder = RunFolder(Path(flags.run)), Path(flags.output)
     files = uploaded(run)
-    result, trained = run.checked_result(), run.flags()
+    result, trained, hyperparams = run.checked_result(), run.flags(), run.hyperparams()
     for name in PATHS:  # files have names, but not where they lie here
         setattr(trained, name, getattr(trained, name) and Path(getattr(trained, name)).name)
-    hyperparams = run.hyperparams()
     at = "" if result["cost_limit"] is None else f" at cost limit {result['cost_limit']}"
     figures = [f"{result['n_timesteps']:,} steps{at}, last epoch: {summary(result)}"]
     for actions, played in result["final"].items():
@@ -134,7 +118,7 @@ def hub(flags: Flags) -> int:
         packages=packages_flag(trained.gym_packages),
         command=trained.command(),
     )
-    (folder / PAGE).write_text(card, encoding="utf-8")
+    (folder / "README.md").write_text(card, encoding="utf-8")
     print(f"Upload it to a repository of yours: hf upload YOU/{trained.algo}-{run.name} {folder}")
     return 0
 

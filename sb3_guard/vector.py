@@ -229,7 +229,6 @@ class GymnasiumVecEnv(BatchVecEnv):
         """Begin an episode in every row; the environment counts from the first row's seed.
 
         :raises ContractError: the space of a row is not that of a row
-        :raises ConnectionError: a process has died, as in any later step
         """
         with answered(self.envs):
             obs, infos = self.envs.reset(seed=self._seeds[0], options=self._options[0] or None)
@@ -372,8 +371,7 @@ class TensorVecEnv(BatchVecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """
-        :raises ContractError: ``step`` does not return five values, or a cost, time-outs or last
-            observations are not of N rows
+        :raises ContractError: not five values, or cost, time-outs, last observations not of N rows
         """
         actions = th.as_tensor(self._actions, dtype=th.float32, device=self.device)
         step = self.envs.step(actions)
@@ -391,9 +389,8 @@ class TensorVecEnv(BatchVecEnv):
         for name, tensor, like in ("final_obs", last, now), ("time_outs", late, reward):
             if getattr(tensor, "shape", None) != like.shape:
                 raise ContractError(f"extras[{name!r}] has no tensor of shape {tuple(like.shape)}")
-        if final is not None:
-            ended = (terminated + truncated > 0).reshape(-1, *[1] * (now.ndim - 1))
-            last = th.where(ended, last, now)
+        ended = (terminated + truncated > 0).reshape(-1, *[1] * (now.ndim - 1))
+        last = th.where(ended, last, now)
         seen = before, actions, last, extras
         cost = self.cost(*seen) if callable(self.cost) else extras.get(self.cost)
         if getattr(cost, "shape", None) != reward.shape:

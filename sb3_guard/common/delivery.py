@@ -135,9 +135,7 @@ class DeliveryCallback(CostEvalCallback):
         self._certified_limits()
         super()._init_callback()
         if (file := self.folder / CERTIFICATE).exists() and not (self.folder / MODEL).exists():
-            raise FileExistsError(
-                f"{file} is not of this callback, which would replace it; choose another folder"
-            )
+            raise FileExistsError(f"{file} would be replaced; move it, or choose another folder")
         for env in (self.eval_env, self.certificate_env):
             refuse_training_only(env)
             sync_normalization(self.training_env, env)
@@ -204,7 +202,10 @@ class DeliveryCallback(CostEvalCallback):
     def _evaluated(self, played: dict[bool, Evaluation]) -> None:
         if 2 * self.num_timesteps < self.model._total_timesteps:
             return
-        with replacing(self._candidates / f"{self.num_timesteps}.pt") as file:
+        path = self._candidates / f"{self.num_timesteps}.pt"
+        if path.exists() and path not in dict(self._read()):  # somebody else's
+            return
+        with replacing(path) as file:
             th.save(self._content(played), file)
         there = self._read()
         if len(there) > CANDIDATES:

@@ -70,7 +70,7 @@ class Footprint:
     :param height: z, m, or a range to draw z from, after x and y
     :param reach: greatest distance of (x, y, z) from ``reach_center``, m
     :param reach_center: the point that the robot's reach is measured from, (x, y, z) m
-    :param hand: places of the robot's hand, [n, 3] m: a centre is within reach / 15 of one
+    :param hand: places of the robot's hand, [n, 3] m, one of which each centre is, or nearly
     :param mover: whether it moves by itself, so that a new goal may ignore it in need
     :param redrawn: whether the first object is drawn again within an episode
     :param last: whether it is also drawn again once everything else has its place
@@ -124,6 +124,11 @@ class Footprint:
                     f"{self.reach_center} even at the best height, {best} m; it reaches "
                     f"{self.reach} m"
                 )
+        if self.hand is not None and self.placements and not len(self._spots):
+            raise ValueError(
+                f"{self.name}: the robot's hand gets to no place in {list(self.placements)} at "
+                f"heights {self.height}: widen placements or height"
+            )
 
     @functools.cached_property
     def _room(self) -> tuple[Array, Array, Array]:
@@ -134,10 +139,20 @@ class Footprint:
         area = span[:, 0] * span[:, 1] + 1e-12
         return low, span, area / area.sum()
 
+    @functools.cached_property
+    def _spots(self) -> Array:
+        """Places of the hand, moved a little into placements and heights, [n, 3] m."""
+        (low, span, _), (bottom, top), hand = self._room, self._range, np.asarray(self.hand)
+        corners = zip(low, low + span, strict=True)
+        moved = np.array([np.clip(hand, (*a, bottom), (*b, top)) for a, b in corners])
+        return moved[np.linalg.norm(moved - hand, axis=2) <= self.reach / 15]
+
     def draw(self, rng: np.random.Generator, n: int) -> Array:
-        """``n`` uniform centres, [2, n] m."""
+        """``n`` uniform centres, [2, n] m, or places of the hand."""
         if self.among:
             return np.array(self.among).T[:, rng.integers(len(self.among), size=n)]
+        if self.hand is not None:
+            return self._spots[rng.integers(len(self._spots), size=n), :2].T
         low, span, share = self._room
         if len(low) > 1:
             which = rng.choice(len(low), size=n, p=share)
@@ -159,29 +174,18 @@ class Footprint:
             high = np.maximum(np.minimum(high, z + room), low)
         if self.hand is None:
             return low + rng.random(len(xy)) * (high - low)
-        gaps = self._gaps(self.hand, xy.T)  # a place near by, drawn, or the nearest
-        ranks = np.where(gaps < (self.reach / 15) ** 2, -rng.random(gaps.shape), gaps)
-        return np.clip(self.hand[ranks.argmin(axis=1), 2], low, high)
+        gaps = np.linalg.norm(self._spots[:, :2] - xy[:, None], axis=2)  # 0 where it was drawn
+        return np.clip(self._spots[gaps.argmin(axis=1), 2], low, high)
 
     @property
     def _range(self) -> tuple[float, float]:
         return self.height if isinstance(self.height, tuple) else (self.height, self.height)
 
-    def _gaps(self, hand: Array, xy: Array) -> Array:
-        """Squared distances of centres [2, ...] at their best heights to the hand, [..., n] m²."""
-        x, y, z = hand.T
-        gaps: Array = (xy[0][..., None] - x) ** 2 + (xy[1][..., None] - y) ** 2
-        gaps += (z - np.clip(z, *self._range)) ** 2
-        return gaps
-
     def out_of_reach(self, draws: Array) -> Array:
         """Which centres, [2, ...] m, leave no height within reach, [...] bool."""
         x, y, z = self.reach_center
         dx, dy = draws[0] - x, draws[1] - y
-        far: Array = dx**2 + dy**2 > self.reach**2 - (np.clip(z, *self._range) - z) ** 2
-        if self.hand is not None and not self.among:
-            far |= self._gaps(self.hand, draws).min(axis=-1) > (self.reach / 15) ** 2
-        return far
+        return dx**2 + dy**2 > self.reach**2 - (np.clip(z, *self._range) - z) ** 2
 
 
 @functools.lru_cache

@@ -384,6 +384,8 @@ def test_objects_on_the_floor_are_out_of_reach_of_an_arm_on_a_high_table(crane):
     engine = base.override(goal={"locations": listed}).build()
     engine.reset(ROW)
     assert engine.places("goal")[0, 0, :2].tolist() in listed
+    with pytest.raises(ValueError, match=r"goal: the robot's hand gets to no place in \[\(1"):
+        base.override(goal={"placements": [[1, 1, 2, 2]]}).build()
 
 
 @pytest.mark.slow

@@ -133,5 +133,5 @@ def test_files_of_others_are_not_overwritten(run, tmp_path, capsys, name):
 
 def test_a_run_is_not_written_into_its_own_folder(run, capsys):
     before = {path: path.stat() for path in run.rglob("*")}
-    refused(hub.main, [str(run), "-o", str(run)], capsys, "which this command has not written")
+    refused(hub.main, [str(run), "-o", str(run)], capsys, "holds files of others")
     assert {path: path.stat() for path in run.rglob("*")} == before

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pandas as pd
 import pytest
 from cost_envs import CostPoint
@@ -38,6 +39,7 @@ from sb3_guard.zoo.cli.usage import UsageError, import_packages
 from sb3_guard.zoo.run import checkpoint
 from sb3_guard.zoo.run import run as run_module
 from sb3_guard.zoo.run.checkpoint import read_checkpoint
+from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import RunFolder
 from sb3_guard.zoo.run.progress import Epochs
 
@@ -263,7 +265,7 @@ def test_processes_of_environments_die(asked, vec_env, forked, tmp_path, monkeyp
 
     def step(self):
         if self.num_timesteps == 100:
-            for one in multiprocessing.active_children()[:1]:
+            for one in multiprocessing.active_children():
                 one.kill()
             if asked:
                 os.kill(os.getpid(), signal.SIGTERM)
@@ -279,6 +281,21 @@ def test_processes_of_environments_die(asked, vec_env, forked, tmp_path, monkeyp
     assert asked == (f"--vec-env {vec_env} has died" not in err)
     assert asked or f"continue with: sb3-guard train -i {run} --gym-packages" in err
     assert read_checkpoint(run / "checkpoint.zip")["num_timesteps"] == 60
+
+
+def test_a_run_closes_processes_whose_answers_are_lost(forked):
+    """Of a step in which another process has died, or which a second Ctrl-C has cut."""
+    import_packages(["registered_envs"])
+    run = run_module.Run(RunFlags(env="CostPoint-v0", vec_env="subproc"), {"cost_limit": 1.0})
+    run.evaluation = run.delivery = None
+    run.env = run.make_envs(2, 0)
+    run.env.reset()
+    run.env.step_async(np.zeros((2, 2), np.float32))
+    run.env.unwrapped.remotes[0].recv()
+    run.close()
+    for process in run.env.unwrapped.processes:
+        process.join(10)
+        assert not process.is_alive()
 
 
 def in_processes(num_envs: int = 1, **kwargs: Any) -> AsyncVectorEnv:

@@ -122,7 +122,7 @@ def test_a_full_disk_is_told_where_the_lock_of_a_dead_owner_can_not_be_replaced(
     run = create(tmp_path)
     die_holding(run.path)
     before = {path: path.stat().st_size for path in run.path.iterdir()}
-    with files_end_at(0), pytest.raises(UsageError, match="can't write to .*: File too large"):
+    with files_end_at(0), pytest.raises(UsageError, match="File too large"):
         with lock(run.path):
             pass
     assert {path: path.stat().st_size for path in run.path.iterdir()} == before

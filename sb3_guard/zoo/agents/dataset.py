@@ -35,7 +35,6 @@ from sb3_guard.zoo.cli.usage import UsageError, explained, interrupts
 #: ``"cost"`` and each cost key that was reported, [T + 1]: 0 at the reset, then those of the steps.
 Episode = dict[str, Any]
 DSRL = ".hdf5"  # how the name of a file ends; other names are Minari's
-CHUNK = 2**14  # bytes of an array that HDF5 stores together
 
 
 class Recorder(VecEnvWrapper):
@@ -117,24 +116,20 @@ def _episode(first: Any, steps: list[tuple[Any, ...]]) -> Episode:
     }
 
 
-def take_room(file: Path, values: int, records: int) -> None:
+def take_room(file: Path, size: int) -> None:
     """
-    Lengthen a file, so that HDF5 has room to write; it cuts off what it does not need.
+    Lengthen a file by so many bytes, into which HDF5 writes; it cuts off what it does not need.
 
-    On a full disk HDF5 leaves a damaged file behind, and crashes when the process ends.
+    On a full disk HDF5 would leave a damaged file, and crash when the process ends.
 
-    :param file: the file; it may be absent, then there only must be room
-    :param values: bytes of what HDF5 is given
-    :param records: bytes of its own records of them
     :raises OSError: there is no room; the file is as it was
     """
-    size = values + values // 4 + records + 2**16
     folder = next(folder for folder in file.parents if folder.is_dir())
     with open(file, "r+b", 0) if file.exists() else TemporaryFile(buffering=0, dir=folder) as room:
         end = room.seek(0, os.SEEK_END)
         try:
             while (left := end + size - room.tell()) > 0:
-                room.write(bytes(min(left, 2**20)))
+                room.write(bytes(left))
         except OSError:
             room.truncate(end)
             raise
@@ -177,10 +172,8 @@ class MinariDataset:
         import minari
         from minari.data_collector import EpisodeBuffer
 
-        infos, several = episodes[0]["infos"], getattr(self.venv.observation_space, "spaces", ())
-        arrays = len(episodes) * (8 + len(infos) + len(several))
-        file = self.place / "data" / "main_data.hdf5"
-        take_room(file, len(pickle.dumps(episodes)), 2**12 * arrays)
+        size = 2 * len(pickle.dumps(episodes)) + 2**16 * len(episodes)  # with HDF5's records
+        take_room(self.place / "data" / "main_data.hdf5", size)
         buffers = [EpisodeBuffer(**episode) for episode in episodes]
         if self.dataset is not None:
             self.dataset.update_dataset_from_buffer(buffers)
@@ -237,7 +230,7 @@ class DSRLFile:
         ]
         joined = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
         self.place.parent.mkdir(parents=True, exist_ok=True)
-        take_room(self.place, sum(new.nbytes for new in joined.values()), CHUNK * len(joined))
+        take_room(self.place, 2**18 + sum(new.nbytes + new.nbytes // 4 for new in joined.values()))
         with h5py.File(self.place, "a") as file:
             file.attrs["metadata"] = json.dumps(self.about)
             for key, new in joined.items():
@@ -245,11 +238,9 @@ class DSRLFile:
                     file[key].resize(len(file[key]) + len(new), axis=0)
                     file[key][-len(new) :] = new
                 else:
-                    shape = new.shape[1:]
-                    rows = max(CHUNK // new[0].nbytes, 1)
-                    file.create_dataset(
-                        key, data=new, maxshape=(None, *shape), chunks=(rows, *shape)
-                    )
+                    rows, shape = max(2**14 // new[0].nbytes, 1), new.shape[1:]
+                    kwargs = {"maxshape": (None, *shape), "chunks": (rows, *shape)}
+                    file.create_dataset(key, data=new, **kwargs)
 
 
 @contextmanager

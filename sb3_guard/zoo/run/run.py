@@ -33,13 +33,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import (
-    VecEnv,
-    VecFrameStack,
-    VecMonitor,
-    VecNormalize,
-    VecVideoRecorder,
-)
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env.vec_video_recorder import VecVideoRecorder
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.algorithms.common.costs import limits_at, time_limit
@@ -312,6 +307,9 @@ class Run:
         others = [evaluation.eval_env] if evaluation else []
         others += [delivery.certificate_env] if delivery else []
         for env in (self.env, *others):
+            if getattr(env.unwrapped, "waiting", False):  # SubprocVecEnv, for answers that are lost
+                for process in getattr(env.unwrapped, "processes", ()):
+                    process.terminate()
             with suppress(*PROCESS_DIED):
                 env.close()
 

@@ -76,7 +76,7 @@ def test_costs_of_other_names_are_those_of_the_monitor(tmp_path, capsys):
     out = capsys.readouterr().out
     for name, played in zip(("sampled", "most likely"), result["final"].values(), strict=True):
         said = out.partition(f"Final policy, {name} actions")[2].partition("\n")[0]
-        assert f"; noise {np.mean(played['bounded']['noise']):.3f}" in said
+        assert f", noise {np.mean(played['bounded']['noise']):.3f}" in said
     assert set(result["final"]["greedy"]["bounded"]) == set(result["costs"]) == {"heat", "noise"}
     assert result["costs"]["noise"]["mean"] == pytest.approx(2 * result["costs"]["heat"]["mean"])
 

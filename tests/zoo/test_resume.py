@@ -287,7 +287,7 @@ def test_a_run_closes_processes_whose_answers_are_lost(forked):
     """Of a step in which another process has died, or which a second Ctrl-C has cut."""
     import_packages(["registered_envs"])
     run = run_module.Run(RunFlags(env="CostPoint-v0", vec_env="subproc"), {"cost_limit": 1.0})
-    run.evaluation = run.delivery = None
+    run.evaluation = None
     run.env = run.make_envs(2, 0)
     run.env.reset()
     run.env.step_async(np.zeros((2, 2), np.float32))

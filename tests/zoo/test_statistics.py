@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from fake_runs import LABELS, fake_run
 
-from sb3_guard.costs import verdict
+from sb3_guard.judging import kept
 from sb3_guard.zoo.cli.markdown import escaped
 from sb3_guard.zoo.results import statistics
 from sb3_guard.zoo.results.figure_data import Data
@@ -101,12 +101,6 @@ def test_each_draw_of_few_seeds_is_taken_equally_often(monkeypatch):
     assert sorted(seen[0]) == pytest.approx(sorted(draws * 371))
 
 
-def test_verdicts():
-    assert verdict(1, 2, 2) == "kept"
-    assert verdict(2, 3, 2) == verdict(1, 3, 2) == "undecided"
-    assert verdict(2.1, 3, 2) == "exceeded"
-
-
 def final(stochastic, greedy) -> dict:
     return {
         name: {"returns": [10.0 + k for k in range(len(costs))], "costs": costs}
@@ -160,12 +154,12 @@ def test_episodes_that_a_wrapper_ended_are_not_judged(tmp_path):
 def test_few_seeds_keep_the_limit_too_often(seeds, share):
     """The shares of docs/leaderboard.md, those of 10,000 cases."""
     rng = np.random.default_rng(1)
-    kept = []
+    shares = []
     for _ in range(600):
         means = np.maximum(rng.normal(25, 4, seeds), 0.1)
         ends = nested_interval([rng.exponential(mean, 100) for mean in means], resamples=3125)
-        kept.append(verdict(*ends, 25) == "kept")
-    assert abs(np.mean(kept) - share) < 3 * (share / 600) ** 0.5
+        shares.append(kept(*ends, 25) == "kept")
+    assert abs(np.mean(shares) - share) < 3 * (share / 600) ** 0.5
 
 
 def test_a_limit_on_the_worst_step_has_its_tier_and_says_nothing_of_the_sum(tmp_path):

@@ -15,7 +15,4 @@ model = make_model(
 )
 env = model.learn(300_000).get_env()
 
-evaluation = evaluate_policy(model, env, n_eval_episodes=10, seed=1)
-print("return", evaluation.estimate(evaluation.returns))
-for name, limit, values in zip(costs, model.cost_limit, evaluation.key_costs.T, strict=True):
-    print(f"{name}, limit {limit}:", evaluation.estimate(values))
+print(evaluate_policy(model, env, n_eval_episodes=10, seed=1))

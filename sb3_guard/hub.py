@@ -104,7 +104,10 @@ def hub(flags: Flags) -> int:
         figures.append("{}: return {}, cost {}".format(PLAYED[actions], *numbers))
     if (file := run.path / "certificate.json").is_file():
         with explained(f"{file} is damaged"):
-            figures.append(str(Certificate.from_json(file.read_text())))
+            certificate = Certificate.from_json(file.read_text())
+        if certificate.env["id"] != trained.env:
+            raise UsageError(f"{file} is of another environment, {certificate.env['id']}")
+        figures.append(str(certificate))
     empty(folder)
     RunFolder.create(trained, hyperparams, trained.command(), folder)
     for path in files:

@@ -93,13 +93,21 @@ def test_a_repository_has_the_certificate(run, capsys, tmp_path):
     assert str(certificate) in capsys.readouterr().out
 
 
+def test_a_certificate_is_not_shown_in_another_world(run, capsys):
+    here = ["-f", str(run), "--n-episodes", "2", "--no-render", *TOY[:2]]
+    assert enjoy.main([*here, "--env-kwargs", "episode_length:12"]) == 0
+    out = capsys.readouterr().out
+    assert "Its certificate is of another environment" in out and "certified: mean" not in out
+
+
 def test_a_certificate_of_another_agent_is_not_shown(run, capsys):
     file = run / "certificate.json"
     before = file.read_text()
     file.write_text(before.replace(json.loads(before)["agent"], "0" * 64))
     here = ["-f", str(run), *TOY[:2], "--n-episodes", "2", "--no-render"]
     assert enjoy.main(here) == 0
-    assert "certified: mean cost" not in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "Its certificate is of another agent" in out and "certified: mean cost" not in out
     file.write_text(before)
 
 

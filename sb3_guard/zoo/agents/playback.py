@@ -199,8 +199,10 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
         sync_envs_normalization(shipped, env)
         shipped.close()
     agent = Agent(run, path, env_id, model, env, stochastic=True)
-    as_certified = not flags.pretrained and agent.certificate is not None
-    agent.stochastic = flags.stochastic or (as_certified and not flags.deterministic)
+    there = None if flags.pretrained else agent._filed()
+    sampled = there is not None and not there.deterministic  # it acts as certified
+    sampled = sampled and agent._foreign(there) != "another agent"
+    agent.stochastic = flags.stochastic or (sampled and not flags.deterministic)
     return agent
 
 

@@ -133,6 +133,13 @@ class Agent:
         foreign = self._foreign(there)
         return f"Its certificate is of {foreign}" if foreign else str(there)
 
+    @property
+    def certified_sampled(self) -> bool:
+        """Whether the agent of a run is certified with sampled actions, in whatever environment."""
+        there = None if PRETRAINED in self.path.parents else self._filed()
+        ours = there is not None and self._foreign(there) != "another agent"
+        return ours and there is not None and not there.deterministic
+
     def _filed(self) -> Certificate | None:
         """The certificate that lies beside the agent, whatever it is of."""
         if PRETRAINED in self.path.parents:
@@ -199,10 +206,7 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
         sync_envs_normalization(shipped, env)
         shipped.close()
     agent = Agent(run, path, env_id, model, env, stochastic=True)
-    there = None if flags.pretrained else agent._filed()
-    sampled = there is not None and not there.deterministic  # it acts as certified
-    sampled = sampled and agent._foreign(there) != "another agent"
-    agent.stochastic = flags.stochastic or (sampled and not flags.deterministic)
+    agent.stochastic = flags.stochastic or (not flags.deterministic and agent.certified_sampled)
     return agent
 
 

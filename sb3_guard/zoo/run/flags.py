@@ -54,10 +54,9 @@ class EvaluationFlags(Command):
     :param n_eval_envs: number of environments to evaluate in (default: one per episode if native,
         else 1)
     :param eval_env_kwargs: arguments of the evaluation environment (default: those of training)
-    :param certify: end with the best evaluated policy of the last half, or the last one, that is
-        certified to keep its limit, by so many fresh episodes, at least 100, or up to four times as
-        many where these would decide, each of up to three; 0: with the last policy (default: 600
-        if the training has the steps of 1,000 full episodes, else 0)
+    :param certify: end with a policy that is certified by so many fresh episodes, at least 100; 0:
+        with the last policy (default: 600 if the training has the steps of 1,000 full episodes,
+        else 0)
 
     Files:
 

@@ -5,6 +5,7 @@ import json
 import math
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from importlib.metadata import version
 from typing import Any, Literal
@@ -281,7 +282,7 @@ def certify(
         are others, one whose mean is above the limit at a look is not looked at again
     :raises ValueError: the limit is no finite number, there are too few episodes, no step reports
         a cost, the normalisation of the model's observations is absent, or a wrapper of ``env`` is
-        for training only, as ``VecEarlyTermination`` and Gymnasium's ``NormalizeReward``
+        for training only, as ``EarlyTermination`` and Gymnasium's ``NormalizeReward``
     """
     fit("n_episodes", n_episodes, int, LEAST, ends="[)")
     fit("tries", tries, int, 1, ends="[)")
@@ -329,7 +330,10 @@ def refuse_training_only(env: VecEnv) -> None:
     :raises ValueError: a wrapper is for training only, or has statistics that move: other costs
         would be certified
     """
-    if getattr(env, "training_only", False):  # of any wrapper
+    marks = [getattr(env, "training_only", False)]  # of any wrapper of a VecEnv
+    with suppress(AttributeError, NotImplementedError):
+        marks += env.get_attr("training_only")  # of single environments
+    if any(marks):
         raise ValueError("a wrapper of env is for training only: certify without it")
     if fault := own_statistics(env):
         raise ValueError(fault)

@@ -1,7 +1,6 @@
 """How good and how safe a policy is: returns and costs of episodes, with their uncertainty."""
 
 import copy
-import inspect
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -274,8 +273,7 @@ def evaluate_policy(
 
     A policy that corrects its actions by the cost of the last step has a true attribute
     ``acts_on_cost`` and is given these costs, shape [n_envs, m], zeros at the start of an
-    episode, as ``predict(..., state=(costs,))``. One whose ``predict`` takes ``action_masks``, as
-    sb3-contrib's MaskablePPO, is given those of environments that have the method.
+    episode, as ``predict(..., state=(costs,))``.
 
     A model's own training environment will do: if ``learn`` is called again, it begins new
     episodes. During a rollout, as in a callback, it is refused. The statistics of
@@ -305,8 +303,6 @@ def evaluate_policy(
     env = as_vec_env(env)
     keys = check_cost_keys(cost_keys_of(model, env) if cost_keys is None else cost_keys)
     check_agent(model, env)
-    takes_masks = "action_masks" in inspect.signature(model.predict).parameters
-    masked = takes_masks and env.has_attr("action_masks")
     zero_if_missing = getattr(model, "missing_cost", "zero") == "zero"
     policy = getattr(model, "policy", model)
     acts_on_cost = getattr(policy, "acts_on_cost", False)
@@ -336,7 +332,6 @@ def evaluate_policy(
                 state=(last_costs,) if acts_on_cost else state,
                 episode_start=starts,
                 deterministic=deterministic,
-                **({"action_masks": np.stack(env.env_method("action_masks"))} if masked else {}),
             )
             observations, rewards, starts, infos = env.step(actions)
             steps += 1

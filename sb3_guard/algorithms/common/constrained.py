@@ -19,7 +19,6 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from sb3_guard.algorithms.common.arguments import (
     check_names,
-    check_theirs,
     documentation,
     hyperparameter,
     signature,
@@ -28,7 +27,6 @@ from sb3_guard.algorithms.common.arguments import (
 from sb3_guard.algorithms.common.costs import Costs, limits_of, time_limit
 from sb3_guard.checks import check_cost_keys
 from sb3_guard.costs import read_costs
-from sb3_guard.lost_costs import refuse_lost_costs
 from sb3_guard.vector import as_vec_env, lacks_statistics, moments_of, normalizer_of
 
 BROKEN_OFF = (
@@ -155,7 +153,6 @@ class Constrained(BaseAlgorithm):
                 value = stated_ones[name].fitted(name, getattr(self, name), parameter.annotation)
                 setattr(self, name, value)
         self.cost_keys = check_cost_keys(self.cost_keys)  # loading turns tuples into lists
-        check_theirs(self)
         for remaining in (1.0, 0.0):
             limits_of(self, remaining)
 
@@ -219,7 +216,6 @@ class Constrained(BaseAlgorithm):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        refuse_lost_costs(self.env)
         if lacks_statistics(self, self.env):
             self._warn_once(
                 "statistics",

@@ -163,7 +163,7 @@ class Constrained(BaseAlgorithm):
         for space in *parts, self.action_space:
             if np.any(getattr(space, "start", 0)):
                 raise ValueError(f"{space}: must begin at 0, where Stable-Baselines3 counts from")
-        if not isinstance(self.costs, Costs) or len(self.costs.total) != len(self.cost_keys):
+        if self.costs is None or len(self.costs.total) != len(self.cost_keys):
             self.costs = Costs(self.cost_limits, self.limit_on, self._stats_window_size)
         self._choose_buffer()
         super()._setup_model()  # type: ignore[safe-super]

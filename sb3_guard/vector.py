@@ -284,12 +284,11 @@ class GymnasiumVecEnv(BatchVecEnv):
         if ended and self.same_step:
             self._obs = each(np.array, obs)
         elif ended:
-            self.end_rows(ended, rows)
+            self._obs = self._begin(dones)
         return self._obs, np.array(rewards, np.float32), dones, rows
 
-    def end_rows(self, rows: Sequence[int], infos: list[dict[str, Any]]) -> Any:
-        """Begin new episodes in some rows; the observations of all rows."""
-        mask = np.isin(np.arange(self.num_envs), rows)
+    def _begin(self, mask: np.ndarray) -> Any:
+        """Begin new episodes in the rows of a mask, [N] bool; the observations of all rows."""
 
         def replaced(obs: np.ndarray, new: Any) -> np.ndarray:
             new = np.asarray(new)
@@ -307,8 +306,7 @@ class GymnasiumVecEnv(BatchVecEnv):
 
         with answered(self.envs):
             new, _ = self.envs.reset(options={"reset_mask": mask.copy()})
-        self._obs = each(replaced, self._obs, new)
-        return self._obs
+        return each(replaced, self._obs, new)
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         return self.envs.render() or [None] * self.num_envs

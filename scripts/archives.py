@@ -3,6 +3,7 @@
 ``NAME.tar.xz`` holds a grid, or ``NAME/ENV.tar.xz`` its runs of an environment.
 """
 
+import json
 import re
 import tarfile
 import tempfile
@@ -10,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -26,6 +28,14 @@ def archives(name: str) -> list[Path]:
     return [*DATA.glob(f"{name}.tar.xz"), *sorted(DATA.glob(f"{name}/*.tar.xz"))]
 
 
+def completed(result: dict[str, Any]) -> dict[str, Any]:
+    """A result with what those written before the first release lack: costs by key, final ones."""
+    limit = result.get("cost_limit")
+    mean = None if "limit_on" in result else result["cost"]  # of several costs the total
+    cost = {"mean": mean, "limit": None if isinstance(limit, list) else limit}
+    return {**result, "costs": {"cost": cost}, "final": {}, **result}
+
+
 @contextmanager
 def unpacked(*names: str) -> Iterator[Results]:
     """The runs of packed grids, whose logs are there within the block."""
@@ -33,6 +43,8 @@ def unpacked(*names: str) -> Iterator[Results]:
         for path in (path for name in names for path in archives(name)):
             with tarfile.open(path) as archive:
                 archive.extractall(folder, filter="data")
+        for file in Path(folder).rglob("result.json"):
+            file.write_text(json.dumps(completed(json.loads(file.read_bytes()))))
         yield read_results([folder])
 
 

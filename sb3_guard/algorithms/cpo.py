@@ -43,13 +43,11 @@ class CPO(TrustRegion):
     margin_lr: float = hyperparameter(0.1)
     recovery: float = hyperparameter(0.98, high=1.0, ends="(]")
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self.margin: Margin = None  # type: ignore[assignment]
-        super().__init__(*args, **kwargs)
+    margin: Margin = None  # type: ignore[assignment]
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        self.margin = Margin.of(self.margin, len(self.cost_keys))
+        self.margin = self.margin or Margin(len(self.cost_keys))
 
     def plan(self, region: Region) -> tuple[th.Tensor, Accept]:
         g, B, delta = region.gradient, region.cost_gradients, region.delta

@@ -4,6 +4,7 @@ import hashlib
 import json
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from importlib.metadata import version
 from typing import Any
@@ -239,7 +240,7 @@ def certify(
     :raises ValueError: the limit is no finite number, there are too few episodes, no step reports
         a cost, an episode costs more than ``most``, the normalisation of the model's observations
         is absent, all environments play the same episode whatever their seeds, or a wrapper of
-        ``env`` is for training only, as ``VecEarlyTermination``
+        ``env`` is for training only, as ``EarlyTermination``
     """
     fit("n_episodes", n_episodes, int, LEAST, ends="[)")
     fit("tries", tries, int, 1, ends="[)")
@@ -284,7 +285,10 @@ def refuse_training_only(env: VecEnv) -> None:
     :raises ValueError: a wrapper is for training only, or has statistics that move: other costs
         would be certified
     """
-    if getattr(env, "training_only", False):  # of any wrapper
+    marks = [getattr(env, "training_only", False)]  # of any wrapper of a VecEnv
+    with suppress(AttributeError, NotImplementedError):
+        marks += env.get_attr("training_only")  # of single environments
+    if any(marks):
         raise ValueError("a wrapper of env is for training only: certify without it")
     if fault := own_statistics(env):
         raise ValueError(fault)

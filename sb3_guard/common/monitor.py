@@ -14,7 +14,6 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor, is_vecenv_wrapp
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_guard.checks import NumberError, check_cost_keys
-from sb3_guard.common.vec_budgets import end_rows
 from sb3_guard.costs import EpisodeCost, EpisodeCosts, number, read_costs
 from sb3_guard.vector import layers, step_limits
 
@@ -124,12 +123,6 @@ class CostMonitor(VecMonitor):
         for episode in self.episodes.step(costs, dones):
             self._report(episode, infos)
         return obs, rewards, dones, infos
-
-    def end_rows(self, rows: Sequence[int], infos: list[dict[str, Any]]) -> Any:
-        """Report the episodes that a wrapper outside ends, and begin new ones."""
-        for i in rows:
-            self._report(self.episodes.end(i), infos)
-        return end_rows(self.venv, rows, infos)
 
     def _report(self, ended: EpisodeCost, infos: list[dict[str, Any]]) -> None:
         """Put an episode that has ended into its last info, and into the csv."""

@@ -94,11 +94,6 @@ class GuardVecEnv(BatchVecEnv):
                 infos[row]["TimeLimit.truncated"] = bool(t.truncated[row] & ~out.terminated[row])
         return self.envs.view(t.obs, t.images), out.reward.astype(np.float32), t.done, infos
 
-    def end_rows(self, rows: Sequence[int], infos: list[dict[str, Any]]) -> Any:
-        """Begin new episodes in some rows; the observations of all rows."""
-        self.envs.engine.reset(np.asarray(rows))
-        return self.envs.view(self.envs.engine.observe(), self.envs.look())
-
     def get_images(self) -> Sequence[np.ndarray | None]:
         return [self.envs.frame(row) for row in range(self.num_envs)]
 

@@ -1,56 +1,23 @@
-"""Wrappers of a ``VecEnv`` that make use of the costs which infos report.
+"""Wrappers that make use of the costs which infos report.
 
-:class:`VecRemainingBudget` shows the agent what is left of a budget, :class:`VecEarlyTermination`
-ends episodes that overspend it, :class:`VecMaxCost` shows the highest cost of an episode so far.
-They go inside or outside of ``CostMonitor``, and inside ``VecNormalize`` and frame stacks.
+:class:`VecRemainingBudget` shows the agent what is left of a budget, and :class:`VecMaxCost` the
+highest cost of an episode so far. Both wrap a ``VecEnv``, inside or outside of ``CostMonitor``, and
+inside ``VecNormalize`` and frame stacks. :class:`EarlyTermination` wraps a single environment, and
+ends episodes that overspend a budget.
 """
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, SupportsFloat
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import RecordConstructorArgs
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_guard.costs import read_costs
 from sb3_guard.fields import fit
-
-
-def end_rows(venv: VecEnv, rows: Sequence[int], infos: list[dict[str, Any]]) -> Any:
-    """End the episodes of some rows and begin new ones there.
-
-    :param rows: their numbers
-    :param infos: of the step that ended them; a monitor adds its statistics there
-    :return: observations, of which those of ``rows`` are new
-    :raises ValueError: a wrapper on the way knows nothing of episodes that others end
-    """
-    if hasattr(type(venv), "end_rows"):
-        return venv.end_rows(rows, infos)  # type: ignore[attr-defined]
-    if isinstance(venv, VecEnvWrapper):
-        raise ValueError(
-            f"VecEarlyTermination can't end single episodes of {type(venv).__name__}: it belongs "
-            "inside of it, next to the environments or CostMonitor"
-        )
-    begun = venv.env_method("reset", indices=rows)
-    observations: Any = [None] * venv.num_envs
-    for row, (obs, _) in zip(rows, begun, strict=True):
-        observations[row] = obs
-    return observations
-
-
-def replace_rows(obs: Any, rows: Sequence[int], new: Any) -> Any:
-    """A batch of observations with those of some rows replaced; the old one is left as it is."""
-    if isinstance(obs, dict):
-        listed = isinstance(new, list)
-        return {
-            key: replace_rows(value, rows, {r: new[r][key] for r in rows} if listed else new[key])
-            for key, value in obs.items()
-        }
-    replaced = obs.copy()
-    for row in rows:
-        replaced[row] = new[row]
-    return replaced
 
 
 class Counted(VecEnvWrapper):
@@ -116,15 +83,6 @@ class Counted(VecEnvWrapper):
             infos[row] = {**infos[row], "terminal_observation": last}
         self.numbers = np.where(dones[:, None], self.first, self.numbers)
         return self._join(obs, self.numbers), rewards, dones, infos
-
-    def end_rows(self, rows: Sequence[int], infos: list[dict[str, Any]]) -> Any:
-        """See :func:`end_rows`."""
-        new = end_rows(self.venv, rows, infos)
-        self.numbers[list(rows)] = self.first
-        if not isinstance(new, list):
-            return self._join(new, self.numbers)
-        pairs = zip(new, self.numbers, strict=True)
-        return [None if obs is None else self._join(obs, row) for obs, row in pairs]
 
 
 class VecRemainingBudget(Counted):
@@ -202,16 +160,15 @@ class VecMaxCost(Counted):
         return rewards, [{**info, **dict(zip(names, row, strict=True))} for info, row in pairs]
 
 
-class VecEarlyTermination(VecEnvWrapper):
-    """End episodes that cost more than their budget, so that overspending gives no reward.
+class EarlyTermination(gym.Wrapper, RecordConstructorArgs):
+    """End an episode that costs more than its budget, so that overspending gives no reward.
 
     The early-terminated MDP of Sun et al. (2021): with it an algorithm for rewards alone respects
     a limit, if rewards are positive. Where they are not, ending early is tempting, and
-    ``final_reward`` must make up for it. The step that overspends is terminal and has
-    ``info["budget_exceeded"]``; using up the budget exactly is allowed.
+    ``final_reward`` must make up for it. The step that overspends is terminal; a budget may be used
+    up exactly. It wraps a single environment: a batch has to end its rows itself.
 
-    :param env: environments that report their cost, perhaps in a ``CostMonitor``, which then
-        reports the episodes that end here, without ``final_reward``
+    :param env: an environment that reports its cost
     :param budget: what an episode may cost, at least 0
     :param final_reward: added to the reward of the step that overspends
     :param cost_key: entry of ``info`` that is counted
@@ -222,43 +179,29 @@ class VecEarlyTermination(VecEnvWrapper):
     training_only = True
 
     def __init__(
-        self, env: VecEnv, budget: float, final_reward: float = 0.0, cost_key: str = "cost"
+        self, env: gym.Env, budget: float, final_reward: float = 0.0, cost_key: str = "cost"
     ) -> None:
+        RecordConstructorArgs.__init__(
+            self, budget=budget, final_reward=final_reward, cost_key=cost_key
+        )
+        gym.Wrapper.__init__(self, env)
         self.budget = fit("budget", budget, float, 0.0, ends="[)")
         self.final_reward = fit("final_reward", final_reward, float)
         self.cost_key = cost_key
-        super().__init__(env)
-        self.episode_costs = np.zeros(env.num_envs)
+        self.episode_cost = 0.0
 
-    def reset(self) -> VecEnvObs:
-        self.episode_costs = np.zeros(self.num_envs)
-        return self.venv.reset()
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        self.episode_cost = 0.0
+        return self.env.reset(seed=seed, options=options)
 
-    def step_wait(self) -> VecEnvStepReturn:
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """
-        :raises ValueError: an info lacks the cost, or it is not a number
+        :raises ValueError: the info lacks the cost, or it is not a number
         """
-        obs, rewards, dones, infos = self.venv.step_wait()
-        self.episode_costs = self.episode_costs + read_costs(infos, [self.cost_key])[0][:, 0]
-        over = self.episode_costs > self.budget
-        if over.any():
-            rewards, infos = np.where(over, rewards + self.final_reward, rewards), list(infos)
-            for row in np.flatnonzero(over).tolist():
-                ended = {"budget_exceeded": True, "TimeLimit.truncated": False}
-                infos[row] = {**infos[row], **ended}
-            rows = np.flatnonzero(over & ~dones).tolist()
-            for row in rows:
-                last: Any = obs
-                several = isinstance(last, dict)
-                last = {key: value[row] for key, value in last.items()} if several else last[row]
-                infos[row]["terminal_observation"] = last
-            if rows:
-                obs = replace_rows(obs, rows, end_rows(self.venv, rows, infos))
-            dones = dones | over
-        self.episode_costs[dones] = 0.0
-        return obs, rewards, dones, infos
-
-    def end_rows(self, rows: Sequence[int], infos: list[dict[str, Any]]) -> Any:
-        """See :func:`end_rows`."""
-        self.episode_costs[list(rows)] = 0.0
-        return end_rows(self.venv, rows, infos)
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        self.episode_cost += float(read_costs([info], [self.cost_key])[0][0, 0])
+        if self.episode_cost > self.budget:
+            reward, terminated = float(reward) + self.final_reward, True
+        return obs, reward, terminated, truncated, info

@@ -231,7 +231,7 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
 
     def restore(self, state: Mapping[str, Any]) -> None:
         super().restore(state)
-        self._ended = np.array(state.get("ended", self._ended))  # runs' older checkpoints lack it
+        self._ended = np.array(state["ended"])
 
     def render(self) -> tuple[Array, ...] | None:
         """One frame per row, [height, width, 3] uint8; never advances physics."""

@@ -64,7 +64,11 @@ def test_first_order_with_ppos_loss_is_ppo_bit_for_bit() -> None:
         states.append(state_of(model.learn(256)))
     assert states[0] == states[1]
     theirs, ours = (model.logger.name_to_value for model in models)
-    for name in ("value_loss", "approx_kl", "policy_gradient_loss", "explained_variance"):
+    assert {name for name in theirs if name.startswith("train/")} <= ours.keys()
+    for name in (
+        "value_loss", "approx_kl", "policy_gradient_loss", "explained_variance", "clip_fraction",
+        "loss", "clip_range", "clip_range_vf", "entropy_loss", "std",
+    ):  # fmt: skip
         assert ours[f"train/{name}"] == pytest.approx(theirs[f"train/{name}"], rel=1e-5), name
 
 
@@ -72,13 +76,8 @@ def test_passes_stop_by_the_kl_of_the_rollout() -> None:
     """One pass where the first already goes too far, all where none does."""
     for target, passes in ((1e-9, 1), (1e9, 10)):
         kwargs: dict[str, Any] = {"n_steps": 32, "target_kl": target, "cost_limit": 1e6, "seed": 0}
-        models = [cls("MlpPolicy", points(), **kwargs) for cls in (FirstOrder, PPOLag)]
-        for model in models:
-            model.set_random_seed(0)
-            assert model.learn(128)._n_updates == passes
-            assert 0.0 < mean_kl(model) < 1.0
-            assert (model.n_epochs, model.target_kl) == (10, target)
-        assert state_of(models[0]) == state_of(models[1])  # SB3's passes, and written out
+        model = FirstOrder("MlpPolicy", points(), **kwargs).learn(128)
+        assert model._n_updates == passes and 0.0 < mean_kl(model) < 1.0
 
 
 @pytest.mark.parametrize("gamma", [0.9, 1.0])

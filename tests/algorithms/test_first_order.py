@@ -326,8 +326,6 @@ def test_cups_second_step_is_stopped_by_its_own_distance() -> None:
             "lambda_smoothing = 1.0 must be at least 0 and less than 1",
         ),
         (FOCOPS, {"temperature": 0.0}, "temperature = 0.0 must be greater than 0"),
-        (PPOLag, {"clip_range": 0.0}, "clip_range = 0.0 must be greater than 0"),
-        (P3O, {"n_epochs": 0}, "n_epochs = 0 must be at least 1"),
     ],
 )
 def test_bad_values_are_named(cls: Any, kwargs: dict[str, Any], message: str) -> None:

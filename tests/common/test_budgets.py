@@ -1,17 +1,15 @@
-"""Budget wrappers of a ``VecEnv``, compared with what is counted by hand."""
+"""Budget wrappers, compared with what is counted by hand."""
 
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from cost_envs import CostPoint
 from gymnasium import spaces
-from stable_baselines3.common.env_util import make_vec_env as sb3_make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_guard import CPO, TRPO, evaluate_policy, make_vec_env
-from sb3_guard.common.vec_budgets import VecEarlyTermination, VecMaxCost, VecRemainingBudget
+from sb3_guard import CPO, TRPO, make_vec_env
+from sb3_guard.common.vec_budgets import EarlyTermination, VecMaxCost, VecRemainingBudget
 
 SUITE = "Goal_Point_8Hazards"
 COSTS = (0.0, 1.0, 0.5, 0.5, 1.0, 0.0)
@@ -83,15 +81,13 @@ def test_the_budget_joins_every_kind_of_observation(shape):
 @pytest.mark.parametrize(("budget", "end"), [(0, 2), (1.0, 3), (1.9, 4), (2.5, 5), (3.0, 6)])
 def test_overspending_ends_the_episode(budget, end):
     """A budget that is spent exactly is kept."""
-    env = VecEarlyTermination(scripted(), budget, final_reward=-2.0)
-    env.reset()
+    env = EarlyTermination(Scripted(), budget, final_reward=-2.0)
     for _ in range(2):  # the second episode begins again
-        steps = play(env, end)
-        assert [dones.all() for _, _, dones, _ in steps] == [False] * (end - 1) + [True]
+        env.reset()
+        steps = [env.step(None) for _ in range(end)]
         over = end < len(COSTS)
-        assert steps[-1][1].tolist() == [-1.0 if over else 1.0] * 2
-        info = steps[-1][3][0]
-        assert ("budget_exceeded" in info) == over == (not info["TimeLimit.truncated"])
+        assert [terminated for _, _, terminated, _, _ in steps] == [False] * (end - 1) + [over]
+        assert steps[-1][1] == (-1.0 if over else 1.0)
 
 
 @pytest.mark.parametrize("flatten", [True, False])
@@ -108,58 +104,6 @@ def test_the_highest_cost_is_observed_and_its_increases_add_up(flatten):
     assert increases.tolist() == [1.0, 3.0]
 
 
-@pytest.mark.parametrize(("inside", "outside_first"), [(True, False), (False, True)])
-def test_our_batch_and_others_end_and_begin_in_the_same_rows(inside, outside_first):
-    """With the monitor inside or outside, episodes and statistics are the same."""
-
-    def wrapped(vec_env):
-        wide = {"hazards": {"num": 8, "size": 0.6, "keepout": 0.2}}
-        how: dict[str, Any] = {"vec_env": vec_env, "max_episode_steps": 40, "env_kwargs": wide}
-        env: Any = make_vec_env(SUITE, 3, seed=5, **how)
-        env = env if inside else env.venv
-        wraps = [lambda e: VecEarlyTermination(e, 0.02), lambda e: VecRemainingBudget(e, 0.2)]
-        for wrap in reversed(wraps) if outside_first else wraps:
-            env = wrap(env)
-        return env
-
-    native, dummy = wrapped("native"), wrapped("dummy")
-    np.testing.assert_array_equal(native.reset(), dummy.reset())
-    rng, over = np.random.default_rng(0), 0
-    for _ in range(90):
-        actions = rng.uniform(-1.0, 1.0, (3, 2)).astype(np.float32)
-        ours, theirs = native.step(actions), dummy.step(actions)
-        for a, b in zip(ours[:3], theirs[:3], strict=True):
-            np.testing.assert_array_equal(a, b)
-        for a, b in zip(ours[3], theirs[3], strict=True):
-            assert ("budget_exceeded" in a) == ("budget_exceeded" in b)
-            over += "budget_exceeded" in a
-            if "terminal_observation" in a:
-                np.testing.assert_array_equal(a["terminal_observation"], b["terminal_observation"])
-                assert not inside or a["episode"]["l"] == b["episode"]["l"] <= 40
-    assert over > 0
-
-
-def test_episodes_that_are_ended_around_monitors_count():
-    def plain():
-        return sb3_make_vec_env(Scripted, 2, seed=0)
-
-    for env in (
-        VecEarlyTermination(plain(), 1.0),
-        VecEarlyTermination(make_vec_env(Scripted), 1.0),
-    ):
-        model = TRPO("MlpPolicy", env, n_steps=32)
-        played = evaluate_policy(model, env, 4)
-        assert played.lengths.tolist() == [3] * 4 and played.costs.tolist() == [1.5] * 4
-
-
-def test_it_belongs_inside_what_keeps_statistics_of_episodes():
-    costly = sb3_make_vec_env(lambda: CostPoint(20, hazard=(-1.0, 0.0)), 2, seed=0)
-    env = VecEarlyTermination(VecNormalize(costly), 0.0)
-    env.reset()
-    with pytest.raises(ValueError, match=r"VecEarlyTermination.*VecNormalize: it belongs inside"):
-        env.step(np.zeros((2, 2), np.float32))
-
-
 def test_algorithms_learn_behind_them():
     env = VecMaxCost(VecRemainingBudget(make_vec_env(SUITE, 2, seed=0), 5.0))
     model = CPO("MlpPolicy", env, n_steps=20, n_critic_updates=1, cost_keys=("cost_increase",))
@@ -171,8 +115,8 @@ def test_algorithms_learn_behind_them():
     [
         (lambda env: VecRemainingBudget(env, 0.0), r"budget ?= ?0\.0"),
         (lambda env: VecRemainingBudget(env, 1.0, unsafe_reward="low"), "unsafe_reward ?= ?'low'"),
-        (lambda env: VecEarlyTermination(env, -1.0), r"budget ?= ?-1\.0"),
-        (lambda env: play(VecEarlyTermination(env, 1.0, cost_key="fees"), 1), "nearest: 'fee'"),
+        (lambda env: EarlyTermination(env.envs[0], -1.0), r"budget ?= ?-1\.0"),
+        (lambda env: play(VecMaxCost(env, ("fees",)), 1), "nearest: 'fee'"),
     ],
 )
 def test_bad_values_are_named(make, message):

@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 
 from sb3_guard import CPO, SCPO, DeliveryCallback, make_vec_env
 from sb3_guard.common.certificate import Certificate, certify
-from sb3_guard.common.vec_budgets import VecEarlyTermination
+from sb3_guard.common.vec_budgets import EarlyTermination
 from sb3_guard.judging import EPISODES
 
 
@@ -238,7 +238,7 @@ def test_an_absent_normaliser_is_refused():
 
 def test_a_wrapper_for_training_only_is_refused():
     """Episodes that end when a budget is spent can't exceed it."""
-    env = VecMonitor(VecEarlyTermination(DummyVecEnv([Lottery]), budget=1.0))
+    env = VecMonitor(DummyVecEnv([lambda: EarlyTermination(Lottery(), budget=1.0)]))
     with pytest.raises(ValueError, match="training only"):
         certify(Idle(), env, 1.0)
     model = CPO("MlpPolicy", Lottery(), n_steps=8)

@@ -8,8 +8,8 @@ import pytest
 import torch as th
 from cost_envs import CostPoint
 from gymnasium import spaces
-from gymnasium.wrappers import MaxAndSkipObservation, TimeLimit
-from sb3_contrib import MaskablePPO, RecurrentPPO
+from gymnasium.wrappers import TimeLimit
+from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.atari_wrappers import MaxAndSkipEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -17,7 +17,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_guard import CPO, CostEvalCallback, evaluate_policy, make_vec_env
 from sb3_guard.common import evaluation
 from sb3_guard.common.adapters import CostFromFunction
-from sb3_guard.common.callbacks import LogCosts
 
 SMALL: dict[str, Any] = {"n_steps": 20, "n_critic_updates": 1, "cost_limit": 5.0, "seed": 0}
 
@@ -73,20 +72,6 @@ class Twice(gym.Wrapper):
         _, earned, _, _, before = self.env.step(action)
         obs, reward, *ends, info = self.env.step(action)
         return obs, reward + earned, *ends, {**info, "cost": info["cost"] + before["cost"]}
-
-
-LOSING = {
-    "Gymnasium's": lambda env: MaxAndSkipObservation(env, 4),
-    "RepeatAction": lambda env: gym.wrappers.RepeatAction(env, 2),
-    "SB3's": lambda env: MaxAndSkipEnv(env, 4),
-    "inside others": lambda env: TimeLimit(MaxAndSkipEnv(TimeLimit(env, 30), 4), 10),
-}
-
-
-@pytest.mark.parametrize("name", LOSING)
-def test_costs_of_repeated_steps_are_not_lost(name):
-    with pytest.raises(ValueError, match="takes several steps and tells the cost of the last"):
-        CPO("MlpPolicy", LOSING[name](Late()), **SMALL).learn(20)
 
 
 def cost_of(observation, action, next_observation, info):
@@ -145,40 +130,6 @@ def test_an_environment_that_is_made_already(env):
 
 
 # What an agent needs beside the observation
-
-
-class Masked(gym.Env):
-    """Only the first action is allowed; another one costs 1. A step observes nothing."""
-
-    def __init__(self) -> None:
-        self.observation_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
-        self.action_space, self.steps = spaces.Discrete(4), 0
-
-    def action_masks(self) -> np.ndarray:
-        return np.array([True, False, False, False])
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.steps = 0
-        return np.zeros(2, np.float32), {}
-
-    def step(self, action):
-        self.steps += 1
-        return np.zeros(2, np.float32), 1.0, False, self.steps == 10, {"cost": float(action > 0)}
-
-
-@pytest.mark.parametrize("n_envs", [3])
-def test_masks_reach_the_agent_in_evaluations_and_the_best_models(n_envs):
-    model = MaskablePPO("MlpPolicy", make_vec_env(Masked, n_envs), n_steps=20, batch_size=20)
-    watcher = CostEvalCallback(make_vec_env(Masked, n_envs), eval_freq=20, verbose=0)
-    model.learn(20 * n_envs, callback=[watcher, LogCosts()])
-    assert watcher.last_mean_cost == 0.0
-    for agent in (model, model.policy):
-        for env in (Masked(), make_vec_env(Masked, n_envs)):
-            assert evaluate_policy(agent, env, 4, deterministic=False).costs.tolist() == [0.0] * 4
-    other = make_vec_env(lambda: CostPoint(5))  # has no masks
-    actions = PPO("MlpPolicy", other, n_steps=10, batch_size=10)
-    assert len(evaluate_policy(actions, other, 2)) == 2
 
 
 def test_recurrent_agents_remember_within_an_episode():

@@ -27,7 +27,6 @@ from sb3_guard import (
 )
 from sb3_guard.common.adapters import CostFromFunction
 from sb3_guard.common.native import GuardVecEnv
-from sb3_guard.common.vec_budgets import VecEarlyTermination
 from sb3_guard.vector import GymnasiumVecEnv, as_vec_env, info_rows
 
 N = 3
@@ -274,19 +273,6 @@ def test_evaluations_take_them_and_know_the_models_own():
     assert other.learn(20)._last_obs is not None
     evaluate_policy(other, shared, 2)
     assert other._last_obs is None  # so the next learn begins new episodes
-
-
-def test_budgets_end_episodes_of_some_rows():
-    env = VecEarlyTermination(CostMonitor(GymnasiumVecEnv(Batch(), cost=far)), budget=1.0)
-    env.seed(0)
-    env.reset()
-    over, lengths = 0, []
-    for _ in range(30):
-        _, _, dones, infos = env.step(np.full((N, 3), 0.5, np.float32))
-        over += sum(info.get("budget_exceeded", False) for info in infos)
-        lengths += [info["episode"]["l"] for info in infos if "episode" in info]
-        assert all("episode" in infos[i] for i in np.flatnonzero(dones))
-    assert over > 5 and sum(lengths) <= 30 * N
 
 
 def mixed_up() -> Any:

@@ -56,12 +56,14 @@ def fake_run(
         mean = returns * epoch / epochs
         rows += [f"{mean + n},10,{epoch},{cost + 0.1 * n}" for n in noise]
     (path / "0.monitor.csv").write_text("\n".join(rows) + "\n")
+    limit = settings.get("cost_limit")
     label, family = LABELS.get(algo, (None, None))
     content = {
         "label": label, "family": family, "algo": algo, "env": env,
         "return": returns, "cost": cost, "length": 10.0,
         "cost_rate": cost / 10, "episodes": 10, "n_timesteps": 100 * epochs, "physics_errors": 0,
-        "cost_limit": settings.get("cost_limit"),
+        "cost_limit": limit, "costs": {"cost": {"mean": cost, "limit": limit}},
+        "final": {},
     } | result  # fmt: skip
     content = {key: value for key, value in content.items() if value is not ...}
     (path / "result.json").write_text(json.dumps(content))

@@ -13,7 +13,7 @@ from cost_envs import CostPoint
 from registered_envs import Broken, Filmed
 from typed import refused
 
-from sb3_guard import ALGORITHMS, CPO, benchmark, enjoy, train
+from sb3_guard import ALGORITHMS, CPO, enjoy, train
 from sb3_guard.envs.rendering import RenderingError
 from sb3_guard.zoo.run.checkpoint import MEMBER
 
@@ -306,30 +306,11 @@ def test_what_is_not_a_number_ends_training_in_a_line(algo, what, capsys, tmp_pa
     assert not list(tmp_path.rglob("result.json"))
 
 
-def test_a_hyperparameter_withdrawn_since_is_left_out(capsys, run, tmp_path):
-    """Of a run's folder; files and command lines name what there is."""
-    path = run / "CostPoint-v0" / "config.yml"
-    path.write_text(yaml.safe_dump({**yaml.safe_load(path.read_text()), "reuse": 0}))
-    grid = [*TOY, *SMALL, "--algos", "cpo", "--seeds", "1", "-f", str(tmp_path)]
-    grid[grid.index("--env")] = "--envs"
-    del grid[grid.index("--seed") : grid.index("--seed") + 2]
-    run.rename(run.with_name("CostPoint-v0_2"))  # where a grid has it
-    here = [*TOY[:2], "-f", str(run.with_name("CostPoint-v0_2")), "--n-episodes", "1"]
-    for main, arguments in (
-        (enjoy.main, [*here, "--no-render"]),
-        (benchmark.main, grid),
-    ):
-        assert main(arguments) == 0
-        err = capsys.readouterr().err
-        assert "reuse left out" in err and err.count("\n") == 1, err
-    (tmp_path / "new.yml").write_text("default: {reuse: 0}")
-    for given in (["-params", "reuse:0"], ["-conf", str(tmp_path / "new.yml")]):
-        refused(train.main, [*LIMITED, *given], capsys, "no hyperparameter 'reuse'")
-
-
 def test_a_run_whose_files_were_edited(run, capsys):
     path = run / "CostPoint-v0" / "config.yml"
     values = yaml.safe_load(path.read_text())
     path.write_text(yaml.safe_dump({**values, "n_steps": 31}))
     refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "n_steps = 31 contradicts 30")
+    path.write_text(yaml.safe_dump({**values, "reuse": 0}))
+    refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "no hyperparameter 'reuse'")
     path.write_text(yaml.safe_dump(values))

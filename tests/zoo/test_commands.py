@@ -418,8 +418,8 @@ def test_dispatcher(capsys, tmp_path):
 
 def test_early_termination_is_for_training_alone(tmp_path):
     """With it, no episode costs much more than its budget, whatever the agent does."""
-    early = "{'sb3_guard.common.vec_budgets.VecEarlyTermination': {'budget': 0.2}}"
-    wrapped = f"vec_env_wrapper:{early}", "normalize:True"
+    early = "{'sb3_guard.common.vec_budgets.EarlyTermination': {'budget': 0.2}}"
+    wrapped = f"env_wrapper:{early}", "normalize:True"
     run = trained(tmp_path, "-n", "480", "-params", *wrapped)
     episodes = load_results(str(run))
     assert (episodes["l"] < 20).any()

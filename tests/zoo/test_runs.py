@@ -69,7 +69,7 @@ def test_folders_may_overlap_and_numbers_sort_as_numbers(tmp_path):
 DAMAGE = {
     "unfinished": lambda run: (run / "result.json").unlink(),
     "is damaged": lambda run: (run / "result.json").write_text('{"return": 1'),
-    "KeyError: 'cost'": lambda run: (run / "result.json").write_text("{}"),
+    "KeyError: 'costs'": lambda run: (run / "result.json").write_text("{}"),
     "no env, algo or seed": lambda run: params(run, "args.yml").write_text("env: 3"),
     "can't read": lambda run: (run / "0.monitor.csv").unlink(),
     "config.yml": lambda run: params(run, "config.yml").write_text("a: ["),

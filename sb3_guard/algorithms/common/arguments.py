@@ -24,16 +24,6 @@ from sb3_guard.spelling import did_you_mean
 
 # Arguments that SB3's own base classes take from the algorithms, not from users.
 _INTERNAL = {"supported_action_spaces", "monitor_wrapper", "support_multi_env", "sde_support"}
-# The ranges of arguments that SB3 does not check.
-_INTEGERS = {  # of at least 1
-    "n_steps", "batch_size", "n_epochs", "buffer_size", "policy_delay", "target_update_interval"
-}  # fmt: skip
-_NUMBERS: dict[str, tuple[float, str]] = {  # from 0 to a number, with the ends of the interval
-    "gamma": (1.0, "[]"), "gae_lambda": (1.0, "[]"), "tau": (1.0, "[]"),
-    "clip_range": (np.inf, "()"), "clip_range_vf": (np.inf, "()"), "target_kl": (np.inf, "()"),
-    "ent_coef": (np.inf, "[)"), "target_policy_noise": (np.inf, "[)"),
-    "target_noise_clip": (np.inf, "[)"), "learning_rate": (np.inf, "()"),
-}  # fmt: skip
 _ONLY = inspect.Parameter.KEYWORD_ONLY
 _HANDS_ON = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
@@ -147,16 +137,3 @@ def check_names(cls: type, given: Iterable[str]) -> None:
             raise TypeError(
                 f"{cls.__name__} takes no argument {name!r}; {did_you_mean(name, public)}"
             )
-
-
-def check_theirs(algorithm: Any) -> None:
-    """
-    Refuse values of SB3's own arguments that it takes silently, or fails at later.
-
-    :raises ValueError: one is out of its range
-    """
-    for name, value in vars(algorithm).items():
-        if name in _INTEGERS and value is not None:
-            setattr(algorithm, name, fit(name, value, int, 1, ends="[)"))
-        elif name in _NUMBERS and isinstance(value, int | float):  # else a schedule, or "auto"
-            fit(name, value, float, 0.0, *_NUMBERS[name])

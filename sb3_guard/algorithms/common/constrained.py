@@ -19,7 +19,6 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from sb3_guard.algorithms.common.arguments import (
     check_names,
-    check_theirs,
     documentation,
     hyperparameter,
     signature,
@@ -29,7 +28,6 @@ from sb3_guard.algorithms.common.costs import Costs, scheduled_limits, time_limi
 from sb3_guard.checks import check_cost_keys
 from sb3_guard.costs import read_costs
 from sb3_guard.judging import Limits
-from sb3_guard.lost_costs import refuse_lost_costs
 from sb3_guard.vector import as_vec_env, lacks_statistics, moments_of, normalizer_of
 
 BROKEN_OFF = (
@@ -155,7 +153,6 @@ class Constrained(BaseAlgorithm):
                 value = stated_ones[name].fitted(name, getattr(self, name), parameter.annotation)
                 setattr(self, name, value)
         self.cost_keys = check_cost_keys(self.cost_keys)  # loading turns tuples into lists
-        check_theirs(self)
         for remaining in (1.0, 0.0):
             scheduled_limits(self, remaining)
 
@@ -166,7 +163,7 @@ class Constrained(BaseAlgorithm):
         for space in *parts, self.action_space:
             if np.any(getattr(space, "start", 0)):
                 raise ValueError(f"{space}: must begin at 0, where Stable-Baselines3 counts from")
-        if not isinstance(self.costs, Costs) or len(self.costs.total) != len(self.cost_keys):
+        if self.costs is None or len(self.costs.total) != len(self.cost_keys):
             self.costs = Costs(self.cost_limits, self.limit_on, self._stats_window_size)
         self._choose_buffer()
         super()._setup_model()  # type: ignore[safe-super]
@@ -219,7 +216,6 @@ class Constrained(BaseAlgorithm):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        refuse_lost_costs(self.env)
         if lacks_statistics(self, self.env):
             self._warn_once(
                 "statistics",

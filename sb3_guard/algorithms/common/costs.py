@@ -1,7 +1,7 @@
 """The costs of a training: limits, episodes, and what they say about the violation."""
 
 import re
-from collections import deque, namedtuple
+from collections import deque
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -11,9 +11,6 @@ from stable_baselines3.common.utils import LinearSchedule
 from sb3_guard.checks import check_per_cost
 from sb3_guard.costs import EpisodeCosts
 from sb3_guard.vector import step_limits
-
-# Agents that were saved while the estimate was one of these are read; their costs begin anew.
-CostEstimate = namedtuple("CostEstimate", "episode_cost horizon violation")
 
 _NUMBER = r"(-?\d+\.?\d*(?:e[+-]?\d+)?)"
 _LINE = re.compile(f"lin_{_NUMBER}_{_NUMBER}")
@@ -172,15 +169,8 @@ class Margin:
     brings, and J_C settles above d. m learns by how much. At a limit of 0 there is no margin.
     """
 
-    def __init__(self, value: np.ndarray) -> None:
-        self.value = value  # m, in units of an episode's cost, shape (m,)
-
-    @classmethod
-    def of(cls, saved: Any, n_costs: int) -> "Margin":
-        """That of a file, which may be an array or nothing; else none yet."""
-        return (
-            saved if isinstance(saved, cls) else cls(np.zeros(n_costs) if saved is None else saved)
-        )
+    def __init__(self, n_costs: int) -> None:
+        self.value = np.zeros(n_costs)  # m, in units of an episode's cost
 
     def violation(self, costs: Costs) -> np.ndarray:
         """(J_C - (d - m)) / T, shape (m,)."""

@@ -1,8 +1,7 @@
 """Epochs of minibatches, as in SB3's PPO, on a custom loss.
 
-What differs from PPO is one hook, ``loss``. Critic, entropy bonus, gradient clipping and
-logs are PPO's, bit for bit: with the loss it comes with, the class is PPO. Algorithms
-that need no other loss than PPO's, as PPO-Lagrangian, inherit from SB3's own ``PPO`` instead.
+What differs from PPO is one hook, ``loss``. Critic, entropy bonus, gradient clipping and logs are
+PPO's, bit for bit: with the loss it comes with and ``target_kl=None``, the class is PPO.
 """
 
 from collections.abc import Callable
@@ -77,6 +76,9 @@ class FirstOrder(CostRollouts, PPO):
         :return: a scalar
         """
         clip = self.clip_range(self._current_progress_remaining)  # type: ignore[operator]
+        self.logger.record("train/clip_range", clip)
+        clipped_ratios = th.mean((th.abs(ratio - 1) > clip).float())
+        self.logger.record_mean("train/clip_fraction", clipped_ratios.item())
         unclipped = batch.advantages * ratio
         clipped = batch.advantages * th.clamp(ratio, 1 - clip, 1 + clip)
         return -th.min(unclipped, clipped).mean()
@@ -157,6 +159,7 @@ class FirstOrder(CostRollouts, PPO):
                 losses["value_loss"] = self._value_loss(batch, predicted.flatten())
                 total = total + self.ent_coef * losses["entropy_loss"]
                 total = total + self.vf_coef * losses["value_loss"]
+                history["loss"] = [total.item()]  # of the last minibatch
             divergence = _divergence(batch, log_prob.detach(), start)
             for name, value in {**losses, kl_name: divergence}.items():
                 history.setdefault(name, []).append(number := value.item())
@@ -171,6 +174,7 @@ class FirstOrder(CostRollouts, PPO):
     def _value_loss(self, batch: CostRolloutBufferSamples, values: th.Tensor) -> th.Tensor:
         if self.clip_range_vf is not None:
             clip = self.clip_range_vf(self._current_progress_remaining)  # type: ignore[operator]
+            self.logger.record("train/clip_range_vf", clip)
             change = th.clamp(values - batch.old_values, -clip, clip)
             values = batch.old_values + change
         return F.mse_loss(batch.returns, values)

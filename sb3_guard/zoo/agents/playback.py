@@ -31,7 +31,7 @@ from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.checkpoint import load_model, read_normalizer
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import RunFolder, folder_name, is_run, latest_run
-from sb3_guard.zoo.run.hyperparams import check, merged, without_withdrawn
+from sb3_guard.zoo.run.hyperparams import check, merged
 from sb3_guard.zoo.run.make_envs import BAD_NUMBERS, source_of
 from sb3_guard.zoo.run.run import Run
 
@@ -175,7 +175,7 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
         run = find_run(flags.folder, flags.algo, flags.env, flags.exp_id, flags.gym_packages)
     filed = RunFlags.read({"gym_packages": run.args().get("gym_packages")}, run.path)
     require_named(run.path, flags, filed, "gym_packages")
-    hyperparams = {**without_withdrawn(run, algorithm(flags.algo)), "callback": None}
+    hyperparams = {**run.hyperparams(), "callback": None}
     hyperparams = check(flags.algo, algorithm(flags.algo), hyperparams)
     named = {"algo": flags.algo, "env": flags.env, "gym_packages": flags.gym_packages}
     played = Run(RunFlags.of(named), hyperparams)

@@ -61,14 +61,14 @@ def read_splits(path: str | Path, epoch: float = math.nan) -> dict[str, pd.DataF
     :param epoch: steps, as for :func:`last_epochs`
     :return: for each of :data:`SPLITS` that the run has, its episodes' ``J_r``, ``M_c`` and, of
         several costs or a limit on the worst step, ``M_c/<name>``: of training those of the last
-        ten epochs, if no wrapper ended them early. Runs of older versions have no final ones
+        ten epochs, if no wrapper ended them early
     :raises UsageError: there is no ``0.monitor.csv``, or it is damaged
     """
     result = json.loads((Path(path) / "result.json").read_bytes())
     splits, limit_on = {}, result.get("limit_on", "sum")
     if not result.get("cut"):
         splits["training"] = last_epochs(read_episodes(path), epoch).filter(regex="^(J_r|M_c)")
-    for split, episodes in result.get("final", {}).items():
+    for split, episodes in result["final"].items():
         bounded = episodes.get("bounded", {}).items()
         keys = {f"M_c/{named(key, limit_on)}": costs for key, costs in bounded}
         costs = {"M_c": episodes["costs"], **keys}

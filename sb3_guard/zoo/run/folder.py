@@ -188,11 +188,7 @@ class RunFolder:
         fix = f"sb3-guard train -i {self.path} writes it again"
         with explained("result.json is damaged", fix=fix):
             result: dict[str, Any] = json.loads(self.result.read_bytes())
-            if "costs" not in result:  # as older versions wrote it: of several costs the total
-                limit = result.get("cost_limit")
-                bounded = None if "limit_on" in result else result["cost"]
-                limit = None if isinstance(limit, list) else limit
-                result["costs"] = {"cost": {"mean": bounded, "limit": limit}}
+            _ = result["costs"]  # every result has them
         return result
 
     def read_result(self) -> dict[str, Any] | None:

@@ -37,7 +37,6 @@ from sb3_guard.zoo.cli.names import (
     with_classes,
 )
 from sb3_guard.zoo.cli.usage import UsageError, explained, read_mapping
-from sb3_guard.zoo.run.folder import RunFolder
 
 # What a hyperparameter file may hold besides the algorithm's own arguments, as in RL-Zoo;
 # `selection_limit` is ours (see CostEvalCallback).
@@ -179,14 +178,6 @@ def annotations(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
         for name, parameter in parameters(algorithm).items()
     }
     return {**hints, **RUN_KEYS, **(NOISE_KEYS if "action_noise" in hints else {})}
-
-
-def without_withdrawn(folder: RunFolder, algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
-    """The hyperparameters of a run, without those of an older version, which are named."""
-    values, names = folder.hyperparams(), annotations(algorithm)
-    if gone := values.keys() - names.keys():
-        print(f"{folder.path}: {', '.join(sorted(gone))} left out: withdrawn", file=sys.stderr)
-    return {name: value for name, value in values.items() if name not in gone}
 
 
 def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) -> dict[str, Any]:

@@ -77,7 +77,6 @@ from sb3_guard.zoo.run.hyperparams import (
     model_arguments,
     normalization,
     read_hyperparams,
-    without_withdrawn,
 )
 from sb3_guard.zoo.run.logger import RunLogger, cut
 from sb3_guard.zoo.run.make_envs import (
@@ -527,7 +526,7 @@ class Run:
         if not is_run(self.path):
             return "new"
         folder = RunFolder(self.path)
-        there = Run(folder.flags(), without_withdrawn(folder, self.algorithm))
+        there = Run(folder.flags(), folder.hyperparams())
         if others := differences(there.identity, self.identity):
             words = [f"{name}: {a} there, {b} here" for name, a, b in others[:3]]
             raise UsageError(
@@ -577,14 +576,14 @@ class Run:
             saved = folder.flags()
             require_named(folder.path, given, saved, *FOLLOWED)
             import_packages(given.gym_packages)
-            values = without_withdrawn(folder, algorithm(saved.algo))
             state = read_checkpoint(folder.checkpoint)
             changed = {name: getattr(given, name) for name in {*given.given, "progress", "verbose"}}
             changed |= {name: getattr(saved, name) for name in ("trained_agent", "hyperparams")}
             run = cls(dataclasses.replace(saved, **changed), folder=folder)
             run.flags.env = run.source.env_id
             overrides = given.overrides()
-            run.hyperparams = check(saved.algo, algorithm(saved.algo), {**values, **overrides})
+            values = {**folder.hyperparams(), **overrides}
+            run.hyperparams = check(saved.algo, algorithm(saved.algo), values)
             free = {"n_timesteps": None, "log_folder": None}
             was = {**saved.values(START), **state["identity"], **free}
             now = {**run.flags.values(START), **run.identity, **free}

@@ -82,9 +82,9 @@ def find_model(run: RunFolder, flags: AgentFlags) -> tuple[Path, Path]:
             allowed = ", ".join(map(str, sorted(kept))) or "none"
             raise UsageError(f"{run.path} kept no model at {steps} steps; allowed: {allowed}")
         model, statistics = kept[steps], run.path / f"rl_model_vecnormalize_{steps}_steps.pkl"
-    elif (run.path / "certificate.json").is_file() and not (
-        flags.load_final or flags.load_last_checkpoint
-    ):
+    elif all(
+        (run.path / name).is_file() for name in ("certificate.json", "certified_model.zip")
+    ) and not (flags.load_final or flags.load_last_checkpoint):
         model = run.path / "certified_model.zip"
         statistics = run.path / "certified_model_vecnormalize.pkl"
     elif run.model.is_file() and not flags.load_last_checkpoint:

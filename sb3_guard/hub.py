@@ -70,8 +70,9 @@ class Flags(Command):
 def uploaded(run: RunFolder) -> list[Path]:
     """The files of a run that are given away; raises UsageError for a link that leaves the run."""
     paths = [run.params / name for name in ("args.yml", "config.yml", "command.txt")]
-    paths += [run.model, run.normalizer, run.monitor]
-    paths += [*run.path.glob("best_model*"), *run.path.glob("certifi*")]
+    paths += [run.model, run.normalizer, run.monitor, run.path / "certificate.json"]
+    for name in ("best_model", "certified_model"):
+        paths += [run.path / f"{name}.zip", run.path / f"{name}_vecnormalize.pkl"]
     for path in paths:
         if not path.resolve().is_relative_to(run.path.resolve()):
             raise UsageError(f"{path} is a link that leaves the run folder; replace it by the file")
@@ -103,6 +104,8 @@ def hub(flags: Flags) -> int:
         numbers = (Mean.of(np.array(played[name], float)) for name in ("returns", "costs"))
         figures.append("{}: return {}, cost {}".format(PLAYED[actions], *numbers))
     if (file := run.path / "certificate.json").is_file():
+        if not (run.path / "certified_model.zip").is_file():
+            raise UsageError(f"{file} is of no certified_model.zip: move it elsewhere")
         with explained(f"{file} is damaged"):
             certificate = Certificate.from_json(file.read_text())
         if certificate.env["id"] != trained.env:

@@ -17,7 +17,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv, VectorWrapper
 from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import is_wrapped
@@ -53,9 +53,9 @@ def as_vec_env(env: Any) -> VecEnv:
 
 def layers(env: Any) -> Iterator[Any]:
     """The wrappers of an environment from the outside in, and the environment itself last."""
-    while isinstance(env, gym.Wrapper | VecEnvWrapper):
+    while isinstance(env, gym.Wrapper | VectorWrapper | VecEnvWrapper):
         yield env
-        env = env.env if isinstance(env, gym.Wrapper) else env.venv
+        env = env.venv if isinstance(env, VecEnvWrapper) else env.env
     yield env
 
 
@@ -94,9 +94,14 @@ def lacks_statistics(model: Any, env: VecEnv | None) -> bool:
 
 def own_statistics(env: VecEnv) -> str:
     """A fault where a wrapper of Gymnasium normalises by statistics of its own; empty: none."""
+    rows = getattr(getattr(env.unwrapped, "envs", None), "unwrapped", None)
     for attribute, name in (("obs_rms", "Observation"), ("return_rms", "Reward")):
         with suppress(NotImplementedError):  # a vectorised environment need not tell
-            if env.has_attr(attribute):
+            has = env.has_attr(attribute)
+            if isinstance(rows, AsyncVectorEnv):
+                with answered(rows):
+                    has = has or any(rows.call("has_wrapper_attr", attribute))
+            if has:
                 fault = "moves its statistics as it plays, and no file has them: use VecNormalize"
                 return f"Normalize{name} {fault}"
     return ""
@@ -180,7 +185,7 @@ class BatchVecEnv(VecEnv):
         self.envs.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        owner = self.envs if hasattr(self.envs, attr_name) else self.spec
+        owner = next((of for of in layers(self.envs) if hasattr(of, attr_name)), self.spec)
         return [getattr(owner, attr_name)] * len(list(self._get_indices(indices)))
 
     def env_method(self, method_name: str, *args: Any, **kwargs: Any) -> list[Any]:
@@ -339,7 +344,7 @@ class TensorVecEnv(BatchVecEnv):
         group: str | None = None,
         clip_actions: float = 5.0,
     ) -> None:
-        inner = getattr(env, "unwrapped", env)  # Gymnasium's wrappers pass no attributes on
+        self.simulator = inner = getattr(env, "unwrapped", env)  # wrappers pass nothing on
         name = type(inner).__name__
         if not hasattr(inner, "device"):
             raise TypeError(f"{name} has no device: algorithms take it as it is")
@@ -385,13 +390,13 @@ class TensorVecEnv(BatchVecEnv):
             last = final.get(self.group) if isinstance(final, Mapping) else final
         late = extras.get("time_outs", th.zeros_like(reward))
         for name, tensor, like in ("final_obs", last, now), ("time_outs", late, reward):
-            if getattr(tensor, "shape", None) != like.shape:
+            if not (isinstance(tensor, th.Tensor) and tensor.shape == like.shape):
                 raise ContractError(f"extras[{name!r}] has no tensor of shape {tuple(like.shape)}")
         ended = (terminated + truncated > 0).reshape(-1, *[1] * (now.ndim - 1))
         last = th.where(ended, last, now)
         seen = before, actions, last, extras
         cost = self.cost(*seen) if callable(self.cost) else extras.get(self.cost)
-        if getattr(cost, "shape", None) != reward.shape:
+        if not (isinstance(cost, th.Tensor) and cost.shape == reward.shape):
             raise ContractError(
                 f"cost={self.cost!r} is no tensor of {len(reward)} numbers; extras: {[*extras]}"
             )
@@ -408,7 +413,7 @@ class TensorVecEnv(BatchVecEnv):
         if rows and not lost:
             ids = th.as_tensor(rows, device=self.device)
             if not self.auto_reset:
-                new = self.envs.reset(env_ids=ids)[0][self.group]
+                new = self.simulator.reset(env_ids=ids)[0][self.group]
                 now = now.index_copy(0, ids, new[ids])
             shown = shown.copy()
             shown[rows] = now[ids].float().cpu().numpy()

@@ -178,7 +178,8 @@ def check_normalizer(normalizer: Any, space: spaces.Space) -> None:
     for name, values in (seen if several else {"": seen}).items():
         part = moments.get(name, RunningMeanStd(shape=zeros[name].shape))
         shapes = {np.shape(numbers) for numbers in (values, part.mean, part.var)}
-        sound = np.isfinite(values).all() and np.all(part.var > 0.0)
+        sound = np.isfinite(values).all() and np.isfinite(part.mean).all()  # values are clipped
+        sound = sound and np.all((part.var > 0.0) & (part.var < np.inf))
         if shapes != {zeros[name].shape} or not sound:
             of = f" of {name!r}" if name else ""
             raise ValueError(
@@ -441,10 +442,10 @@ class _Tally:
         """Whether an episode that a step ended has come to its true end.
 
         Where a wrapper outside Monitor has ended it, it goes on if Monitor has not been reset, as
-        after a life lost in Atari.
+        after a life lost in Atari: else its rewards are those of steps that the reset took, if any.
         """
         reset = not self.monitored or "episode" in info
-        return reset or not self.env.get_attr("rewards", [row])[0]
+        return reset or len(self.env.get_attr("rewards", [row])[0]) <= self.costs.lengths[row]
 
     def _end(self, cost: EpisodeCost, info: dict[str, Any]) -> None:
         """Count an episode that is over, if one is still to be played."""

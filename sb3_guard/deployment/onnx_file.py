@@ -126,11 +126,11 @@ def check(model: BaseAlgorithm, sampled: bool, path: Path) -> None:
     Acting(model, sampled)
     if path.suffix != ".onnx":
         raise ValueError(f"path={str(path)!r}: must end in .onnx")
-    beside, name = path.with_name(CONTRACT), path.name
+    beside, name = path.with_name(CONTRACT), ""
     with suppress(OSError, ValueError, KeyError, TypeError):  # absent, or not one of ours
         name = str(json.loads(beside.read_bytes())["file"]["name"])
-    if name != path.name and (path.parent / name).is_file():
-        raise ValueError(f"{beside} is that of {name}: choose another folder")
+    if beside.exists() and name != path.name and (not name or (path.parent / name).is_file()):
+        raise ValueError(f"{beside} is that of {name or 'something else'}: choose another folder")
 
 
 def _json(data: Mapping[str, Any]) -> bytes:

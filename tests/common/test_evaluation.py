@@ -10,7 +10,8 @@ import pytest
 import torch as th
 from cost_envs import CostPoint
 from gymnasium import spaces
-from gymnasium.wrappers import TimeLimit
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import NormalizeReward, TimeLimit, vector
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import (
@@ -25,11 +26,13 @@ from sb3_guard.algorithms import CPO, TRPOSL, SACLag
 from sb3_guard.common.certificate import certify
 from sb3_guard.common.evaluation import (
     Evaluation,
+    check_agent,
     evaluate_policy,
     sync_normalization,
 )
 from sb3_guard.common.monitor import CostMonitor
 from sb3_guard.judging import Mean
+from sb3_guard.vector import as_vec_env, own_statistics
 
 
 class Fixed(gym.Env):
@@ -137,6 +140,21 @@ def test_an_episode_that_a_wrapper_outside_of_monitor_cuts_is_over():
     assert sorted(seen.costs.tolist()) == [30, 30, 60, 60]
     model = CPO("MlpPolicy", cut(5), n_steps=30, n_critic_updates=1).learn(30)
     assert (model.costs.horizon, model.costs.episode_cost.tolist()) == (3, [60])
+
+
+class Waiting(gym.Wrapper):
+    """Begins each episode with a step, as ``NoopResetEnv`` does."""
+
+    def reset(self, **kwargs):
+        self.env.reset(**kwargs)
+        obs, _, _, _, info = self.env.step(0)
+        return obs, info
+
+
+def test_so_is_one_whose_reset_takes_steps():
+    env = DummyVecEnv([lambda: TimeLimit(Waiting(Monitor(Fixed(9))), 3)])
+    seen = evaluate_policy(Idle(), env, 2)
+    assert (seen.lengths.tolist(), seen.costs.tolist()) == ([3, 3], [90, 90])
 
 
 class Cutting(VecEnvWrapper):
@@ -377,6 +395,23 @@ def test_wrappers_with_statistics_of_their_own_are_named(name):
         evaluate_policy(model, env, 1)
     with pytest.raises(ValueError, match=f"^{name} moves its statistics"):
         certify(model, env, 1.0)
+
+
+def test_they_are_named_wherever_gymnasium_has_them():
+    rows, kwargs = [lambda: CostPoint(10)], {"autoreset_mode": AutoresetMode.SAME_STEP}
+    inner = AsyncVectorEnv([lambda: NormalizeReward(CostPoint(10))], **kwargs)
+    outer = vector.NormalizeReward(SyncVectorEnv(rows, **kwargs))
+    for env in (inner, vector.RecordEpisodeStatistics(outer)):
+        assert own_statistics(as_vec_env(env)).startswith("NormalizeReward moves")
+        env.close()
+
+
+def test_statistics_that_are_not_finite_are_refused():
+    for infinite in ("mean", "var"):
+        env = VecNormalize(DummyVecEnv([lambda: CostPoint(10)]))
+        getattr(env.obs_rms, infinite)[0] = np.inf  # clipped, or divided by, it makes a number
+        with pytest.raises(ValueError, match=r"statistics do not fit .* not finite"):
+            check_agent(object(), env)
 
 
 def test_an_agent_of_normalized_observations_is_not_given_raw_ones():

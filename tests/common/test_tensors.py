@@ -112,8 +112,9 @@ def test_time_outs_are_apart_from_deaths():
 
 @pytest.mark.parametrize("how", [{"auto_reset": False}, {"tells_last": True}])
 def test_the_last_observation_is_that_of_the_simulator(how):
-    """Also in what the cost is computed from."""
-    env = TensorVecEnv(Simulator(**how), cost=lambda obs, a, after, extras: after[:, 0] - obs[:, 0])
+    """Also in what the cost is computed from, and with a wrapper that knows no ``env_ids``."""
+    wrapped = gym.wrappers.OrderEnforcing(Gymnasiums(**how))
+    env = TensorVecEnv(wrapped, cost=lambda obs, a, after, extras: after[:, 0] - obs[:, 0])
     env.reset()
     for step in range(1, 9):
         obs, _, dones, infos = env.step(np.zeros((N, 1)))
@@ -170,6 +171,9 @@ def test_it_trains():
 class Gymnasiums(Simulator, gym.Env):
     """As those of Isaac Lab, which ``gymnasium.make`` may wrap."""
 
+    def reset(self, *, seed: Any = None, options: Any = None, env_ids: Any = None) -> Any:
+        return super().reset(seed=seed, env_ids=env_ids)
+
 
 class FourValues(Simulator):
     def step(self, action: th.Tensor) -> Any:
@@ -197,6 +201,7 @@ class LastOfFew(Simulator):
             "TimeLimit ends all rows at once: set the episode length of Gymnasiums",
         ),
         (lambda: stepped("cost", FourValues()), "step returned 4 values, not five"),
+        (lambda: stepped(lambda *_: np.zeros(N)), "is no tensor of 4 numbers"),
         (lambda: stepped("cost", LastOfFew()), r"'final_obs'\] has no tensor of shape \(4, 2\)"),
     ],
 )

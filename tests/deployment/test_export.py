@@ -232,7 +232,8 @@ def test_frames_are_stacked_before_they_are_normalised(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"contract.json is that of .*policy.onnx: choose another"):
         sb3_guard.export(model, tmp_path / "other.onnx")
     (tmp_path / "contract.json").write_text('{"file": []}')  # of another program
-    check(model, False, tmp_path / "other.onnx")
+    with pytest.raises(ValueError, match=r"contract.json is that of something else: choose"):
+        check(model, False, tmp_path / "policy.onnx")
 
 
 # Our robots, and the contract

@@ -319,10 +319,10 @@ CRANE = """<mujoco><compiler angle="degree"/><worldbody><body name="base" {base}
 
 @pytest.fixture
 def crane():
-    def write(base, turn="", lift="", elbow="", center="hand", suite="Goal_Crane_0Hazards"):
+    def write(base, turn="", lift="", elbow="", suite="Goal_Crane_0Hazards", more="", **stated):
         text = CRANE.format(base=base, turn=turn, lift=lift, elbow=elbow)
-        spec = add_servos(mujoco.MjSpec.from_string(text))
-        register_robot("Crane", xml=spec, center=center)
+        spec = mujoco.MjSpec.from_string(text.replace("</mujoco>", f"{more}</mujoco>"))
+        register_robot("Crane", xml=add_servos(spec), **{"center": "hand"} | stated)
         return Scenario.parse(suite)
 
     with own_parts():
@@ -411,6 +411,39 @@ def test_nearly_all_goals_of_an_arm_can_be_reached(crane, base, turn):
 def test_an_arm_that_never_rises_above_the_floor_is_answered_in_a_line(crane):
     with pytest.raises(ValueError, match=r"'imu' is never above the floor, .*: raise .* by pos"):
         crane('pos="0 0 0"', center="imu")
+
+
+def test_an_arm_of_one_joint_reaches_where_its_hand_is(crane):
+    engine = crane('pos="0 0 0.9"', 'range="-0.1 0.1"', elbow='range="-0.1 0.1"').build(20)
+    assert engine.robot.reach == pytest.approx(0.8, abs=0.01)
+    gaps = np.linalg.norm(goals_of(engine) - [0.0, 0.0, 0.95], axis=1)
+    assert abs(gaps - 0.8).max() <= engine.task.size
+
+
+def test_a_reach_within_which_the_hand_never_is_is_named(crane):
+    with pytest.raises(ValueError, match=r"never above the floor, z = 0, within reach=0\.01 m"):
+        crane('pos="0 0 0.9"', reach=0.01)
+
+
+def test_joints_follow_those_that_they_are_tied_to(crane):
+    tied = '<equality><joint joint1="elbow" joint2="lift" polycoef="0 -1 0 0 0"/></equality>'
+    engine = crane('pos="0 0 0.9"', more=tied).build(20)
+    places = engine.robot.hand - [0.0, 0.0, 0.95]
+    # the upper link points anywhere, and the lower one up
+    np.testing.assert_allclose(np.linalg.norm(places - [0, 0, 0.4], axis=1), 0.4)
+    fixed = '<equality><joint joint1="elbow" polycoef="1.5708 0 0 0 0"/></equality>'
+    places = crane('pos="0 0 0.9"', more=fixed).build().robot.hand - [0.0, 0.0, 0.95]
+    np.testing.assert_allclose(np.linalg.norm(places, axis=1), 0.4 * 2**0.5, rtol=1e-4)
+
+
+def test_an_arm_whose_geoms_meet_nothing_has_links(crane):
+    text = CRANE.format(base="", turn="", lift="", elbow="").replace(
+        "<worldbody>", '<default><geom contype="0" conaffinity="0"/></default><worldbody>'
+    )
+    register_robot("Ghostly", xml=add_servos(mujoco.MjSpec.from_string(text)), center="hand")
+    engine = Scenario.parse("Goal_Ghostly_0Hazards").build()
+    engine.reset(ROW)
+    assert engine.robot.clearance(np.array([[[0.0, 0.0, 0.25]]]), False)[0, 0] < 0.0
 
 
 def test_clearance_of_an_arm_is_that_of_its_nearest_link(arm):

@@ -126,12 +126,32 @@ def test_files_of_others_are_not_overwritten(run, tmp_path, capsys, name):
         staged(run, folder)
     (folder / name).parent.mkdir(parents=True, exist_ok=True)
     (folder / name).write_text("mine")
-    before = {path: path.stat() for path in folder.rglob("*")}
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     refused(hub.main, [str(run), "-o", str(folder)], capsys, f"{folder} holds", name, "-o")
-    assert {path: path.stat() for path in folder.rglob("*")} == before
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+
+
+def test_only_what_a_run_writes_is_uploaded(run, tmp_path):
+    copied = tmp_path / "run"
+    shutil.copytree(run, copied)
+    for name in ("certificate_private.key", "best_model_notes.txt"):
+        (copied / name).write_text("mine")
+    staged(copied, tmp_path / "agent")
+    assert not {*(tmp_path / "agent").glob("*private*"), *(tmp_path / "agent").glob("*notes*")}
+
+
+def test_a_certificate_without_its_model_is_not_shown(run, tmp_path, capsys):
+    copied = tmp_path / "run"
+    shutil.copytree(run, copied)
+    (copied / "certificate.json").write_text("{}")  # as certify --json may write it
+    refused(
+        hub.main, [str(copied), "-o", str(tmp_path / "agent")], capsys, "no certified_model.zip"
+    )
+    assert enjoy.main([*PLAY, "-f", str(copied), "--n-episodes", "1"]) == 0
+    assert f"Playing {copied / 'Filmed-v0.zip'}" in capsys.readouterr().out
 
 
 def test_a_run_is_not_written_into_its_own_folder(run, capsys):
-    before = {path: path.stat() for path in run.rglob("*")}
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
     refused(hub.main, [str(run), "-o", str(run)], capsys, "holds files of others")
-    assert {path: path.stat() for path in run.rglob("*")} == before
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before

@@ -72,7 +72,8 @@ class FileArm(MJCFRobot):
         super().bind(sim)
         model = sim.model
         meets = (model.geom_contype | model.geom_conaffinity) != 0
-        geoms = np.flatnonzero(np.isin(model.geom_bodyid, self.bodies(model)) & meets)
+        of_arm = np.flatnonzero(np.isin(model.geom_bodyid, self.bodies(model)))
+        geoms = of_arm[meets[of_arm]] if meets[of_arm].any() else of_arm
         middle, half = model.geom_aabb[geoms, :3], model.geom_aabb[geoms, 3:]
         longest, rows = half.argmax(axis=1), np.arange(len(geoms))
         radii = np.sort(half, axis=1)[:, 1]

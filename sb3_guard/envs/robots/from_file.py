@@ -129,12 +129,12 @@ def _arm(end: str, places: Array, shoulder: Array, reach: float | None) -> dict[
     :raises ValueError: its end effector, ``end``, is never above the floor
     """
     away = np.linalg.norm(places - shoulder, axis=1)
-    reach = reach or 0.9 * float(away.max())
+    reach = reach or float(max(0.9 * away.max(), np.median(away)))  # all alike: of one joint
     places = places[(away <= reach) & (places[:, 2] >= 0.001)]
     if not len(places):
         raise ValueError(
-            f"{end} is never above the floor, z = 0: raise its outermost body by pos, or name "
-            "another end effector, center="
+            f"{end} is never above the floor, z = 0, within reach={reach:.3g} m: raise its "
+            "outermost body by pos, or name another end effector, center="
         )
     low, high = np.quantile(places[:, 2], [0.2, 0.8]).tolist()
     size = round(0.1 * reach, 3)

@@ -23,9 +23,14 @@ def reached(model: mujoco.MjModel, body: str, site: str | None) -> Array:
     low, high = np.where(model.jnt_limited, model.jnt_range.T, [[-math.pi], [math.pi]])
     single = np.isin(model.jnt_type, [mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE])
     where = model.jnt_qposadr[single]
+    address, start = model.jnt_qposadr, model.qpos0
     places = np.empty((SAMPLES, 3))
     for place in places:
         data.qpos[where] = rng.uniform(low, high)[single]
+        for i in np.flatnonzero((model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0):
+            joint, other = address[model.eq_obj1id[i]], address[model.eq_obj2id[i]]
+            away = (data.qpos[other] - start[other]) * (model.eq_obj2id[i] >= 0)
+            data.qpos[joint] = start[joint] + np.polyval(model.eq_data[i, 4::-1], away)
         mujoco.mj_kinematics(model, data)
         place[:] = data.body(body).xpos if site is None else data.site(site).xpos
     return places

@@ -83,7 +83,7 @@ def find_model(run: RunFolder, flags: AgentFlags) -> tuple[Path, Path]:
             allowed = ", ".join(map(str, sorted(kept))) or "none"
             raise UsageError(f"{run.path} kept no model at {steps} steps; allowed: {allowed}")
         model, statistics = kept[steps], run.path / f"rl_model_vecnormalize_{steps}_steps.pkl"
-    elif (run.path / "certificate.json").is_file() and not (
+    elif all((run.path / name).is_file() for name in ("certificate.json", MODEL)) and not (
         flags.load_final or flags.load_last_checkpoint
     ):
         model = run.path / MODEL

@@ -30,7 +30,7 @@ from sb3_guard.zoo.run.hyperparams import entry, read_file, shipped_file
 def observation_table(env: GuardVectorEnv) -> str:
     """Name, slice, bounds and unit of every component of the observation; joints one by one."""
     rows = []
-    for name, start, stop, low, high, unit in env.components:
+    for name, start, stop, low, high, unit, _ in env.components:
         where = str(start) if name.startswith(("qpos ", "qvel ")) else f"{start}:{stop}"
         rows.append([name, where, f"[{low:g}, {high:g}]", unit])
     if env.engine.extras.camera is not None:

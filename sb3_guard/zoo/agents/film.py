@@ -19,6 +19,7 @@ from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
 from sb3_guard.costs import bounded_name
+from sb3_guard.vector import step_limits
 from sb3_guard.zoo.cli.usage import UsageError, explained
 
 
@@ -57,7 +58,9 @@ def below(text: str, picture: np.ndarray) -> np.ndarray:
 
 
 @contextmanager
-def filming(env: VecEnv, model: BaseAlgorithm | None, video: Path) -> Iterator[Callable[[], None]]:
+def filming(
+    env: VecEnv, model: BaseAlgorithm | None, video: Path, verbose: int = 0
+) -> Iterator[Callable[[], None]]:
     """
     What writes the picture of a step that was taken: ``evaluate_policy(…, on_step=film)``.
 
@@ -67,6 +70,7 @@ def filming(env: VecEnv, model: BaseAlgorithm | None, video: Path) -> Iterator[C
     :param env: one environment, in a ``CostMonitor``
     :param model: whose limits are said
     :param video: mp4 to write
+    :param verbose: 1 prints how far it is, every hundred steps
     :raises UsageError: no picture can be rendered, or the file can't be written
     """
     env.reset()
@@ -84,10 +88,15 @@ def filming(env: VecEnv, model: BaseAlgorithm | None, video: Path) -> Iterator[C
         )  # fmt: skip
         writer.send(None)
 
+        limits = step_limits(env)
+        most = f" of at most {limits[0]:,.0f}" if limits else ""
+
         def film() -> None:
-            if find_monitor(env).episodes.lengths[0]:  # else it is of the next episode by now
+            if steps := find_monitor(env).episodes.lengths[0]:  # else it is of the next by now
                 picture: Any = render(env)
                 writer.send(np.ascontiguousarray(below(caption(env, model), picture)))
+                if verbose and steps % 100 == 0:
+                    print(f"  filmed {steps} steps{most}", flush=True)
 
         with closing(writer):
             yield film

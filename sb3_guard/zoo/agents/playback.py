@@ -62,6 +62,24 @@ def find_run(
     )
 
 
+def only_algorithm(flags: AgentFlags) -> str:
+    """
+    The algorithm whose runs are the only ones of the environment, or that of the flags.
+
+    :raises UsageError: several algorithms have runs; the message lists them
+    """
+    name = folder_name(with_version(flags.env))
+    runs = {
+        path.name: f"{path.name}/{name}_{number}"
+        for path in sorted(Path(flags.folder).glob("*"))
+        if "algo" not in flags.given and (number := latest_run(path, name))
+    }
+    if len(runs) > 1:
+        listed = ", ".join(runs.values())
+        raise UsageError(f"{flags.folder} has several runs: {listed}; choose one with --algo")
+    return next(iter(runs), flags.algo)
+
+
 def find_model(run: RunFolder, flags: AgentFlags) -> tuple[Path, Path]:
     """
     The model that the flags ask for, and where its observation statistics are, if it has any.
@@ -149,6 +167,7 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
         with explained(f"{run.params / 'args.yml'} is damaged"):
             flags.algo, flags.env = (str(run.args()[name]) for name in ("algo", "env"))
     else:
+        flags.algo = only_algorithm(flags)
         run = find_run(flags.folder, flags.algo, flags.env, flags.exp_id, flags.gym_packages)
     filed = RunFlags.read({"gym_packages": run.args().get("gym_packages")}, run.path)
     require_named(run.path, flags, filed, "gym_packages")
@@ -215,7 +234,7 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
             print(agent.certificate)
     shown: AbstractContextManager[Any] = nullcontext(None)
     if video is not None:
-        shown = filming(agent.env, agent.model, video)
+        shown = filming(agent.env, agent.model, video, flags.verbose)
     elif render_mode == "human":
         shown = nullcontext(partial(render, agent.env))
     asked = episodes or flags.n_timesteps or 1

@@ -41,7 +41,12 @@ from sb3_guard.algorithms.common.costs import time_limit
 from sb3_guard.common.callbacks import CostEvalCallback, LogCosts, selection_limits
 from sb3_guard.common.certificate import MOST
 from sb3_guard.common.delivery import DeliveryCallback
-from sb3_guard.common.evaluation import check_normalizer, evaluate_policy, sync_normalization
+from sb3_guard.common.evaluation import (
+    LONGEST,
+    check_normalizer,
+    evaluate_policy,
+    sync_normalization,
+)
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
 from sb3_guard.common.sources import Source
@@ -92,6 +97,7 @@ from sb3_guard.zoo.run.progress import Epochs, summary
 
 FINAL_EPISODES = 100  # of each policy, after training
 DELIVERY_ENVS = 50  # in which candidates are screened and certified
+UPDATES, WHOLE = 30, 20  # with which a training learns: updates, and whole episodes in each
 WANDB = "wandb.txt"  # beside the run's configuration: its id at Weights & Biases
 
 
@@ -641,20 +647,44 @@ class Run:
             print(f"{words} at {result['n_timesteps']:,} steps, {seconds:.0f} s")
             print(f"  last epoch         {summary(result)}\n  run folder         {folder.path}")
             if finished:
+                self._beside_standing()
                 print(f"  see the agent      {folder.play(flags)}")
             else:
                 print(f"  continue with      {folder.again(flags)}")
         return 0 if finished else 128 + (received or [signal.SIGTERM])[0]
 
     def _advise(self) -> None:
-        """Say it where a training has so few updates that little is learnt."""
+        """Say it where a training has so few updates or episodes that little is learnt."""
         steps, model = self.hyperparams["n_timesteps"], self.model
-        if isinstance(model, OnPolicyAlgorithm) and steps >= 10_000:
-            updates = max(steps // (model.n_envs * model.n_steps), 1)
-            if updates < 10:
+        if unlimited := without_time_limit(self.env, self.flags.env):
+            print(unlimited)
+        if not isinstance(model, OnPolicyAlgorithm) or steps < 10_000:
+            return
+        episode = int(time_limit(self.env) or 1)
+        updates = max(steps // (model.n_envs * model.n_steps), 1)
+        if steps < (least := UPDATES * WHOLE * episode) and (
+            updates < 10 or steps < 10 * WHOLE * episode
+        ):
+            print(
+                f"{steps:,} steps are {steps // episode:,} episodes: too few; at least {least:,}, "
+                f"which are {UPDATES} updates of {WHOLE} episodes"
+            )
+        elif updates < 10:
+            length = steps // (UPDATES * WHOLE * episode) * episode
+            print(
+                f"Only {updates} update{'s' * (updates > 1)} in {steps:,} steps; -params "
+                f"n_envs:{WHOLE} n_steps:{length} makes {steps // (WHOLE * length)}"
+            )
+
+    def _beside_standing(self) -> None:
+        """Say it where a delivered agent does no better than one that does nothing."""
+        certificate = self.delivery.certificate if self.delivery else None
+        if self.delivery and certificate:
+            standing = standing_return(self.delivery.eval_env, evaluation_seed(self.flags.seed))
+            if standing is not None and certificate.mean_return <= standing:
                 print(
-                    f"Only {updates} update{'s' * (updates > 1)} in {steps:,} steps; "
-                    f"-params n_envs:8 n_steps:{steps // 240} makes 30"
+                    "  the delivered agent does no better than standing still: return "
+                    f"{certificate.mean_return:.4g}, zero actions {standing:.4g} in one episode"
                 )
 
     def _checkpoints(
@@ -778,6 +808,37 @@ class Run:
                     bounded = zip(played.cost_keys, played.limited.T, strict=True)
                     final[name]["bounded"] = {key: rounded(costs) for key, costs in bounded}
         return final
+
+
+def without_time_limit(env: VecEnv, env_id: str) -> str | None:
+    """Advice where an environment states no time limit; None where it does."""
+    if time_limit(env) is not None:
+        return None
+    return (
+        f"{env_id} states no time limit: if no step ends its episodes, no cost of an episode is "
+        "known; --env-kwargs max_episode_steps:1000 (env_kwargs in Python) sets one"
+    )
+
+
+def standing_return(env: VecEnv, seed: int = 0) -> float | None:
+    """
+    The return of one episode in which every action is 0, or as near to 0 as the space allows.
+
+    :param env: environments in a :class:`CostMonitor`, such as those for evaluation, whose first
+        row plays; its episode under way is broken off
+    :param seed: of the episode
+    :return: None: actions are not numbers, or the episode does not end
+    """
+    if not isinstance(space := env.action_space, spaces.Box):
+        return None
+    still = np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
+    seed_rows(env, seed)
+    env.reset()
+    for _ in range(int(time_limit(env) or LONGEST)):
+        infos = env.step(np.array([still] * env.num_envs))[3]
+        if episode := infos[0].get("episode"):
+            return float(episode["r"])
+    return None
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:

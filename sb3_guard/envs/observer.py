@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -64,6 +65,21 @@ class Observer:
     def channels_of(self, part: Part) -> dict[str, Channel]:
         """Size, bounds and unit of what one part lets the robot observe, by name."""
         return {name: self._channel(what) for name, what in part.observations().items()}
+
+    def described(self) -> dict[str, dict[str, Any]]:
+        """What real sensors have to deliver, by component: formula, order, frames and axes."""
+        found = {name: what for part in self._parts for name, what in part.observations().items()}
+        return {name: self._described(name, what) for name, what in found.items()}
+
+    def _described(self, name: str, what: Scan | Compass | Values) -> dict[str, Any]:
+        robot: Any = self._robot
+        if isinstance(what, Values):
+            return robot.described(name) if hasattr(robot, "described") else {}
+        frames = getattr(robot, "sensing", None) or getattr(robot, "lidar_bodies", ())
+        seen = {"frames": frames, "axes": "xyz"[: self._coordinates(what)]}
+        if isinstance(what, Scan):
+            return seen | self._lidar.described(what.planar)
+        return seen | {"direction": "v / (|v| + 0.001)"}
 
     def _channel(self, what: Scan | Compass | Values) -> Channel:
         if isinstance(what, Values):

@@ -24,6 +24,7 @@ by :meth:`Part.current`; as an attribute it is its greatest value.
 from __future__ import annotations
 
 import math
+import re
 import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -413,6 +414,13 @@ class Constraint(Part):
     def cost(self) -> Array:
         """The cost of this step, [N], at least 0."""
         raise NotImplementedError
+
+    def per_step(self) -> str:
+        """What a step costs: the docstring from "Cost" on, with the values of ``parameters``."""
+        said = re.search(r"\bCost\b.*", " ".join((type(self).__doc__ or "").split()))
+        values = {name: value for name, value in vars(self).items() if value is not None}
+        text = said[0] if said else ""
+        return re.sub("``(.*?)``", lambda name: str(values.get(name[1], name[1])), text)
 
     def costs(self) -> dict[str, Array]:
         """What is reported as ``cost_<name>``, by name, [N] each; together they are the cost."""

@@ -38,16 +38,12 @@ BROKEN_OFF = (
 
 
 class CostBar(ProgressBarCallback):
-    """SB3's progress bar, with the mean cost of the latest episodes beside the limit."""
+    """SB3's progress bar, with the mean costs of the latest episodes."""
 
     def _on_rollout_end(self) -> None:
-        model: Any = self.model
-        if model.costs.latest:
-            means = np.mean(model.costs.latest, axis=0)
-            rows = zip(model.cost_keys, means, model.cost_limits, strict=True)
-            limited = " (limit {:g})" if model.constrained else ""
-            words = [f"{key} {mean:.2f}{limited.format(limit)}" for key, mean, limit in rows]
-            self.pbar.set_description(", ".join(words), refresh=False)
+        if latest := self.model.costs.latest:  # type: ignore[attr-defined]
+            means = map("{:.2f}".format, np.mean(latest, axis=0))
+            self.pbar.set_description(f"cost {', '.join(means)}", refresh=False)
 
 
 class Constrained(BaseAlgorithm):

@@ -412,16 +412,20 @@ class MJCFRobot(Robot):
                 return Values(-self._axes[:, 2], -1.0, 1.0, "direction")
         return Values(self._last, unit="action")
 
-    def joints_of(self, name: str) -> dict[str, list[Any]]:
-        """The joints of a computed observation in its order, for the loop around a policy.
+    def described(self, name: str) -> dict[str, Any]:
+        """What an observation measures, for the loop around a policy.
 
         :param name: of the observation
-        :return: ``joints``, of positions ``first_pose``, qpos that they are relative to, rad or m,
-            and of hinges with slides ``unit``, that of each number; empty of other observations
+        :return: of a sensor its type (``sensor``), what it is ``on`` and whose ``axes`` it is
+            along; of joints ``joints``, of positions ``first_pose``, qpos that they are relative
+            to, rad or m, and of hinges with slides ``unit``, that of each number
         """
-        if not self.aware or name not in self._numbers or name not in self._senses:
-            return {}
         model = self.sim.model
+        if name not in self._senses:
+            return sensors.described(model, self._prefix + name, self._prefix)
+        if name not in self._numbers:
+            moves = name != "last_action"
+            return {"axes": self.root.removeprefix(self._prefix)} if moves else {}
         names = [model.joint(i).name.removeprefix(self._prefix) for i, _ in self._numbers[name]]
         joints: dict[str, list[Any]] = {"joints": names}
         if len(set(self._units[name])) > 1 and name != "joint_turn":

@@ -60,6 +60,23 @@ def bounds(model: mujoco.MjModel, name: str) -> tuple[float, float, str]:
     return 0.0 if kind == _SENSOR.mjSENS_TOUCH else -math.inf, math.inf, unit
 
 
+def described(model: mujoco.MjModel, name: str, prefix: str) -> dict[str, str]:
+    """Type of a sensor, what it is on, and along whose axes it measures, by these names."""
+    i = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
+    if i < 0:
+        return {}
+    kinds, ids = (
+        (model.sensor_objtype, model.sensor_reftype),
+        (model.sensor_objid, model.sensor_refid),
+    )
+    on, axes = (
+        (mujoco.mj_id2name(model, int(kind[i]), int(it[i])) or "world").removeprefix(prefix)
+        for kind, it in zip(kinds, ids, strict=True)
+    )
+    kind = _SENSOR(int(model.sensor_type[i])).name[7:].lower()
+    return {"sensor": kind, "on": on, "axes": axes if kind[:5] in ("frame", "subtr") else on}
+
+
 def bodies(model: mujoco.MjModel, sensor: int) -> set[int]:
     """The bodies that a sensor is on or relates something to."""
     found = set()

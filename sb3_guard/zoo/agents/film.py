@@ -19,7 +19,6 @@ from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
 from sb3_guard.costs import bounded_name
-from sb3_guard.vector import step_limits
 from sb3_guard.zoo.cli.usage import UsageError, explained
 
 
@@ -88,15 +87,12 @@ def filming(
         )  # fmt: skip
         writer.send(None)
 
-        limits = step_limits(env)
-        most = f" of at most {limits[0]:,.0f}" if limits else ""
-
         def film() -> None:
             if steps := find_monitor(env).episodes.lengths[0]:  # else it is of the next by now
                 picture: Any = render(env)
                 writer.send(np.ascontiguousarray(below(caption(env, model), picture)))
                 if verbose and steps % 100 == 0:
-                    print(f"  filmed {steps} steps{most}", flush=True)
+                    print(f"  filmed {steps} steps", flush=True)
 
         with closing(writer):
             yield film

@@ -62,22 +62,13 @@ def find_run(
     )
 
 
-def only_algorithm(flags: AgentFlags) -> str:
-    """
-    The algorithm whose runs are the only ones of the environment, or that of the flags.
-
-    :raises UsageError: several algorithms have runs; the message lists them
-    """
-    name = folder_name(with_version(flags.env))
-    runs = {
-        path.name: f"{path.name}/{name}_{number}"
-        for path in sorted(Path(flags.folder).glob("*"))
-        if "algo" not in flags.given and (number := latest_run(path, name))
-    }
-    if len(runs) > 1:
-        listed = ", ".join(runs.values())
-        raise UsageError(f"{flags.folder} has several runs: {listed}; choose one with --algo")
-    return next(iter(runs), flags.algo)
+def only_algorithm(folder: str, env_id: str, default: str) -> str:
+    """The algorithm that has runs of an environment; raises UsageError where several have."""
+    name = folder_name(with_version(env_id))
+    algos = sorted(path.name for path in Path(folder).glob("*") if latest_run(path, name))
+    if len(algos) > 1:
+        raise UsageError(f"{folder!r} has runs of {env_id} by {', '.join(algos)}: add --algo")
+    return algos[0] if algos else default
 
 
 def find_model(run: RunFolder, flags: AgentFlags) -> tuple[Path, Path]:
@@ -167,7 +158,8 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
         with explained(f"{run.params / 'args.yml'} is damaged"):
             flags.algo, flags.env = (str(run.args()[name]) for name in ("algo", "env"))
     else:
-        flags.algo = only_algorithm(flags)
+        if "algo" not in flags.given:
+            flags.algo = only_algorithm(flags.folder, flags.env, flags.algo)
         run = find_run(flags.folder, flags.algo, flags.env, flags.exp_id, flags.gym_packages)
     filed = RunFlags.read({"gym_packages": run.args().get("gym_packages")}, run.path)
     require_named(run.path, flags, filed, "gym_packages")

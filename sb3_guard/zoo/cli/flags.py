@@ -142,24 +142,13 @@ class Command:
         :param argv: arguments; None: those of the process
         :raises UsageError: a flag is unknown, with the nearest name, or a value is not allowed
         """
-        parser = cls.parser()
-        required = [a for a in parser._get_positional_actions() if a.nargs is None]
-        for action in required:
-            action.nargs, action.required = "?", False
-        namespace, unknown = parser.parse_known_args(argv)
+        namespace, unknown = cls.parser().parse_known_args(argv)
         if unknown:
             word = unknown[0].split("=")[0]
             near = nearest(word, map(_long, cls.names()))
             remedy = f"did you mean {near}?" if near else "see --help"
             raise UsageError(f"unknown argument {word}; {remedy}")
-        given = vars(namespace)
-        for name in (a.dest for a in required if given.get(a.dest) is None):
-            # A flag that takes several values has taken this one, too: --gym-packages m ENV
-            several = [v for v in given.values() if isinstance(v, list) and len(v) > 1]
-            if not several:
-                raise UsageError(f"the following arguments are required: {name}")
-            given[name] = several[-1].pop()
-        return cls.of(cls._read(given))
+        return cls.of(cls._read(vars(namespace)))
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> Self:

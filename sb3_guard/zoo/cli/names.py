@@ -7,11 +7,9 @@ file may name classes of :data:`KNOWN` packages only, and of modules that the co
 
 import importlib
 import operator
-import os
 import shlex
 import sys
 from collections.abc import Mapping
-from importlib.machinery import PathFinder
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -141,15 +139,8 @@ def require_named(where: object, given: "Command", filed: "Command", *names: str
     for name in names:
         value = getattr(filed, name)
         if value and value != PAPER and not getattr(given, name):
-            look = ", ".join(map(_source, value)) if name == "gym_packages" else where
+            look = ", ".join(value) if isinstance(value, list) else f"its {name}"
             raise UsageError(
                 f"{where} needs {name}, which only the command line may name; look at {look}, then "
                 f"add {shlex.join(filed.words({name}))}"
             )
-
-
-def _source(module: str) -> str:
-    """The file of a module or of its package, found without running it; else its name."""
-    top = module.partition(".")[0]
-    spec = PathFinder.find_spec(top, [os.getcwd(), *sys.path])
-    return spec.origin if spec is not None and spec.origin else module

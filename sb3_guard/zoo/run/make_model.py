@@ -1,6 +1,5 @@
 """A model in Python as the commands make it: environment, normalisation and hyperparameters."""
 
-import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +14,7 @@ from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.hyperparams import annotations
-from sb3_guard.zoo.run.run import Run, without_time_limit
+from sb3_guard.zoo.run.run import Run
 
 if TYPE_CHECKING:
     from sb3_guard.envs.scenario import Scenario
@@ -101,11 +100,9 @@ def make_model(
         model = run.make_model()
     except UsageError as error:
         raise ValueError(str(error)) from error
-    env = model.get_env()
-    assert env is not None
-    if unlimited := without_time_limit(env, flags.env):
-        warnings.warn(unlimited, UserWarning, stacklevel=2)
     if monitor_path is not None:
+        env = model.get_env()
+        assert env is not None
         find_monitor(env).log_to(monitor_path)
     model.verbose, model.tensorboard_log = verbose, tensorboard_log
     return model

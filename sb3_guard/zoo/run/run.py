@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from multiprocessing.util import register_after_fork
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Self
 
 import gymnasium as gym
@@ -41,12 +42,7 @@ from sb3_guard.algorithms.common.costs import time_limit
 from sb3_guard.common.callbacks import CostEvalCallback, LogCosts, selection_limits
 from sb3_guard.common.certificate import MOST
 from sb3_guard.common.delivery import DeliveryCallback
-from sb3_guard.common.evaluation import (
-    LONGEST,
-    check_normalizer,
-    evaluate_policy,
-    sync_normalization,
-)
+from sb3_guard.common.evaluation import check_normalizer, evaluate_policy, sync_normalization
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
 from sb3_guard.common.sources import Source
@@ -97,7 +93,6 @@ from sb3_guard.zoo.run.progress import Epochs, summary
 
 FINAL_EPISODES = 100  # of each policy, after training
 DELIVERY_ENVS = 50  # in which candidates are screened and certified
-UPDATES, WHOLE = 30, 20  # with which a training learns: updates, and whole episodes in each
 WANDB = "wandb.txt"  # beside the run's configuration: its id at Weights & Biases
 
 
@@ -445,6 +440,9 @@ class Run:
             th.set_num_threads(flags.num_threads)
         set_random_seed(flags.seed)
         env = self.make_envs(self.hyperparams["n_envs"], flags.seed)
+        if time_limit(env) is None:
+            advice = "env_kwargs max_episode_steps:1000 sets one, if its episodes do not end"
+            warnings.warn(f"{flags.env} states no time limit: {advice}", stacklevel=2)
         try:
             model = self._make_model(env)
             seed_rows(env, flags.seed)
@@ -656,36 +654,26 @@ class Run:
     def _advise(self) -> None:
         """Say it where a training has so few updates or episodes that little is learnt."""
         steps, model = self.hyperparams["n_timesteps"], self.model
-        if unlimited := without_time_limit(self.env, self.flags.env):
-            print(unlimited)
         if not isinstance(model, OnPolicyAlgorithm) or steps < 10_000:
             return
         episode = int(time_limit(self.env) or 1)
-        updates = max(steps // (model.n_envs * model.n_steps), 1)
-        if steps < (least := UPDATES * WHOLE * episode) and (
-            updates < 10 or steps < 10 * WHOLE * episode
-        ):
-            print(
-                f"{steps:,} steps are {steps // episode:,} episodes: too few; at least {least:,}, "
-                f"which are {UPDATES} updates of {WHOLE} episodes"
-            )
-        elif updates < 10:
-            length = steps // (UPDATES * WHOLE * episode) * episode
-            print(
-                f"Only {updates} update{'s' * (updates > 1)} in {steps:,} steps; -params "
-                f"n_envs:{WHOLE} n_steps:{length} makes {steps // (WHOLE * length)}"
-            )
+        updates, least = max(steps // (model.n_envs * model.n_steps), 1), 600 * episode
+        if min(updates, steps // (20 * episode)) >= 10:
+            return
+        words = f"Only {updates} update{'s' * (updates > 1)} in {steps:,} steps"
+        if length := steps // least * episode:
+            how = f"-params n_envs:20 n_steps:{length} makes {steps // (20 * length)}"
+        else:
+            words = f"{steps:,} steps are {steps // episode:,} episodes: too few"
+            how = f"at least {least:,}, 30 updates of 20 episodes"
+        print(f"{words}; {how}")
 
     def _beside_standing(self) -> None:
         """Say it where a delivered agent does no better than one that does nothing."""
-        certificate = self.delivery.certificate if self.delivery else None
-        if self.delivery and certificate:
+        if self.delivery and (certificate := self.delivery.certificate):
             standing = standing_return(self.delivery.eval_env, evaluation_seed(self.flags.seed))
             if standing is not None and certificate.mean_return <= standing:
-                print(
-                    "  the delivered agent does no better than standing still: return "
-                    f"{certificate.mean_return:.4g}, zero actions {standing:.4g} in one episode"
-                )
+                print(f"  no better than standing still, of return {standing:.4g} in one episode")
 
     def _checkpoints(
         self, folder: RunFolder, epochs: Epochs, asked_to_stop: Callable[[], bool]
@@ -810,35 +798,14 @@ class Run:
         return final
 
 
-def without_time_limit(env: VecEnv, env_id: str) -> str | None:
-    """Advice where an environment states no time limit; None where it does."""
-    if time_limit(env) is not None:
-        return None
-    return (
-        f"{env_id} states no time limit: if no step ends its episodes, no cost of an episode is "
-        "known; --env-kwargs max_episode_steps:1000 (env_kwargs in Python) sets one"
-    )
-
-
 def standing_return(env: VecEnv, seed: int = 0) -> float | None:
-    """
-    The return of one episode in which every action is 0, or as near to 0 as the space allows.
-
-    :param env: environments in a :class:`CostMonitor`, such as those for evaluation, whose first
-        row plays; its episode under way is broken off
-    :param seed: of the episode
-    :return: None: actions are not numbers, or the episode does not end
-    """
+    """The return of an episode of actions 0, or the nearest to it; None: there is no such."""
     if not isinstance(space := env.action_space, spaces.Box):
         return None
-    still = np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
-    seed_rows(env, seed)
-    env.reset()
-    for _ in range(int(time_limit(env) or LONGEST)):
-        infos = env.step(np.array([still] * env.num_envs))[3]
-        if episode := infos[0].get("episode"):
-            return float(episode["r"])
-    return None
+    still = np.array([np.clip(np.zeros(space.shape), space.low, space.high)] * env.num_envs)
+    policy: Any = SimpleNamespace(predict=lambda *args, **kwargs: (still, None))
+    returns = evaluate_policy(policy, env, 1, seed=seed).returns
+    return float(returns[0]) if len(returns) else None
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:

@@ -26,7 +26,7 @@ from sb3_guard.deployment.environment import (
 from sb3_guard.deployment.observations import OBSERVATION, inputs_of
 from sb3_guard.spelling import did_you_mean
 
-FORMAT = 3  # increased when the content changes
+FORMAT = 4  # increased when the content changes
 HOLD = "hold"  # the last value is sent again
 _NOISE = "independent standard normal numbers, drawn anew in each step"
 _LAST_COST = "cost of the step before, 0 when an episode begins, NaN if it is not known"

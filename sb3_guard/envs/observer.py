@@ -76,7 +76,7 @@ class Observer:
         if isinstance(what, Values):
             return robot.described(name) if hasattr(robot, "described") else {}
         frames = getattr(robot, "sensing", None) or getattr(robot, "lidar_bodies", ())
-        seen = {"frames": frames, "axes": "xyz"[: self._coordinates(what)]}
+        seen = {"frames": [*frames], "axes": "xyz"[: self._coordinates(what)]}
         if isinstance(what, Scan):
             return seen | self._lidar.described(what.planar)
         return seen | {"direction": "v / (|v| + 0.001)"}

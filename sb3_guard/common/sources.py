@@ -71,8 +71,7 @@ def find(env_id: Any) -> Source:
     """
     if hasattr(env_id, "step") and not isinstance(env_id, type):
         kind = type(getattr(env_id, "unwrapped", env_id)).__name__
-        spec = getattr(env_id, "spec", None)
-        name = repr(spec.id) if spec else f"lambda: {kind}(...)"
+        name = repr(spec.id) if (spec := getattr(env_id, "spec", None)) else f"lambda: {kind}(...)"
         raise TypeError(
             f"this {kind} is made already: give its id or a function that makes it, such as {name}"
         )

@@ -68,18 +68,16 @@ class Observer:
 
     def described(self) -> dict[str, dict[str, Any]]:
         """What real sensors have to deliver, by component: formula, order, frames and axes."""
-        found = {name: what for part in self._parts for name, what in part.observations().items()}
-        return {name: self._described(name, what) for name, what in found.items()}
-
-    def _described(self, name: str, what: Scan | Compass | Values) -> dict[str, Any]:
-        robot: Any = self._robot
-        if isinstance(what, Values):
-            return robot.described(name) if hasattr(robot, "described") else {}
-        frames = getattr(robot, "sensing", None) or getattr(robot, "lidar_bodies", ())
-        seen = {"frames": [*frames], "axes": "xyz"[: self._coordinates(what)]}
-        if isinstance(what, Scan):
-            return seen | self._lidar.described(what.planar)
-        return seen | {"direction": "v / (|v| + 0.001)"}
+        robot, found = self._robot, dict[str, dict[str, Any]]()
+        bodies: Any = getattr(robot, "sensing", None) or getattr(robot, "lidar_bodies", ())
+        for name, what in [each for part in self._parts for each in part.observations().items()]:
+            if isinstance(what, Values):
+                found[name] = getattr(robot, "described", lambda name: {})(name)
+                continue
+            said = {"direction": "v / (|v| + 0.001)"}
+            said = self._lidar.described(what.planar) if isinstance(what, Scan) else said
+            found[name] = {"frames": [*bodies], "axes": "xyz"[: self._coordinates(what)], **said}
+        return found
 
     def _channel(self, what: Scan | Compass | Values) -> Channel:
         if isinstance(what, Values):

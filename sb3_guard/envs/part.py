@@ -417,10 +417,9 @@ class Constraint(Part):
 
     def per_step(self) -> str:
         """What a step costs: the docstring from "Cost" on, with the values of ``parameters``."""
-        said = re.search(r"\bCost\b.*", " ".join((type(self).__doc__ or "").split()))
-        values = {name: value for name, value in vars(self).items() if value is not None}
-        text = said[0] if said else ""
-        return re.sub("``(.*?)``", lambda name: str(values.get(name[1], name[1])), text)
+        said = "".join(re.findall(r"\bCost\b.*", self.__doc__ or "", re.DOTALL))
+        values = {name: str(value) for name, value in vars(self).items() if value is not None}
+        return re.sub("``(.*?)``", lambda it: values.get(it[1], it[1]), " ".join(said.split()))
 
     def costs(self) -> dict[str, Array]:
         """What is reported as ``cost_<name>``, by name, [N] each; together they are the cost."""

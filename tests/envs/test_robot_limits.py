@@ -22,9 +22,8 @@ def test_a_step_of_a_cost_is_told_in_words_and_units():
     said = {part.name: part.per_step() for part in engine.constraints}
     step = "in each step at whose end"
     assert said == {
-        "jointtorque": f"Cost 1.0 {step} actuators exert more than 0.5 N m on a joint.",
-        "baseheight": f"Cost 3.0 {step} its position is below 0.05 m, by default half of its height "
-        "at the start, or above high m.",
+        "jointtorque": f"Cost 1.0 {step} actuators exert over 0.5 N m on a joint.",
+        "baseheight": f"Cost 3.0 {step} its position is below 0.05 or above high m.",
     }
     hazards = {indicator: {"hazards": {"indicator": indicator}} for indicator in (False, True)}
     said = [

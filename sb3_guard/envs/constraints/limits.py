@@ -46,8 +46,7 @@ class Limit(Constraint):
 class BaseHeight(Limit):
     """The robot neither falls nor jumps.
 
-    Cost ``weight`` in each step at whose end its position is below ``low`` m, by default
-    half of its height at the start, or above ``high`` m.
+    Cost ``weight`` in each step at whose end its position is below ``low`` or above ``high`` m.
     """
 
     name = "baseheight"
@@ -158,8 +157,7 @@ class JointSpeed(JointLimit):
 class JointTorque(JointLimit):
     """Actuators are not strained.
 
-    Cost ``weight`` in each step at whose end actuators exert more than ``limit`` N m on a
-    joint.
+    Cost ``weight`` in each step at whose end actuators exert over ``limit`` N m on a joint.
     """
 
     name = "jointtorque"

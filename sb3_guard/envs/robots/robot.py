@@ -415,17 +415,14 @@ class MJCFRobot(Robot):
     def described(self, name: str) -> dict[str, Any]:
         """What an observation measures, for the loop around a policy.
 
-        :param name: of the observation
-        :return: of a sensor its type (``sensor``), what it is ``on`` and whose ``axes`` it is
-            along; of joints ``joints``, of positions ``first_pose``, qpos that they are relative
-            to, rad or m, and of hinges with slides ``unit``, that of each number
+        :return: ``sensor``, ``on`` and ``axes``; of joints ``joints``, ``first_pose``, qpos that
+            positions are relative to, rad or m, and ``unit`` of each number where these differ
         """
         model = self.sim.model
         if name not in self._senses:
             return sensors.described(model, self._prefix + name, self._prefix)
         if name not in self._numbers:
-            moves = name != "last_action"
-            return {"axes": self.root.removeprefix(self._prefix)} if moves else {}
+            return {"axes": self.root.removeprefix(self._prefix)} if name != "last_action" else {}
         names = [model.joint(i).name.removeprefix(self._prefix) for i, _ in self._numbers[name]]
         joints: dict[str, list[Any]] = {"joints": names}
         if len(set(self._units[name])) > 1 and name != "joint_turn":

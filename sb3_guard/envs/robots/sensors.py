@@ -62,16 +62,12 @@ def bounds(model: mujoco.MjModel, name: str) -> tuple[float, float, str]:
 
 def described(model: mujoco.MjModel, name: str, prefix: str) -> dict[str, str]:
     """Type of a sensor, what it is on, and along whose axes it measures, by these names."""
-    i = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
-    if i < 0:
+    if (i := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)) < 0:
         return {}
-    kinds, ids = (
-        (model.sensor_objtype, model.sensor_reftype),
-        (model.sensor_objid, model.sensor_refid),
-    )
+    it = model.sensor(i)
     on, axes = (
-        (mujoco.mj_id2name(model, int(kind[i]), int(it[i])) or "world").removeprefix(prefix)
-        for kind, it in zip(kinds, ids, strict=True)
+        (mujoco.mj_id2name(model, kind[0], number[0]) or "world").removeprefix(prefix)
+        for kind, number in ((it.objtype, it.objid), (it.reftype, it.refid))
     )
     kind = _SENSOR(int(model.sensor_type[i])).name[7:].lower()
     return {"sensor": kind, "on": on, "axes": axes if kind[:5] in ("frame", "subtr") else on}

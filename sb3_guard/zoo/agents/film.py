@@ -4,6 +4,7 @@ Gymnasium's and SB3's recorders keep all pictures of an episode in memory, some 
 at this size; here each is written as it is taken.
 """
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -57,9 +58,7 @@ def below(text: str, picture: np.ndarray) -> np.ndarray:
 
 
 @contextmanager
-def filming(
-    env: VecEnv, model: BaseAlgorithm | None, video: Path, verbose: int = 0
-) -> Iterator[Callable[[], None]]:
+def filming(env: VecEnv, model: BaseAlgorithm | None, video: Path) -> Iterator[Callable[[], None]]:
     """
     What writes the picture of a step that was taken: ``evaluate_policy(…, on_step=film)``.
 
@@ -69,7 +68,6 @@ def filming(
     :param env: one environment, in a ``CostMonitor``
     :param model: whose limits are said
     :param video: mp4 to write
-    :param verbose: 1 prints how far it is, every hundred steps
     :raises UsageError: no picture can be rendered, or the file can't be written
     """
     env.reset()
@@ -91,8 +89,8 @@ def filming(
             if steps := find_monitor(env).episodes.lengths[0]:  # else it is of the next by now
                 picture: Any = render(env)
                 writer.send(np.ascontiguousarray(below(caption(env, model), picture)))
-                if verbose and steps % 100 == 0:
-                    print(f"  filmed {steps} steps", flush=True)
+                if steps % 100 == 0:
+                    print(f"filmed {steps} steps", file=sys.stderr)
 
         with closing(writer):
             yield film

@@ -226,7 +226,7 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
             print(agent.certificate)
     shown: AbstractContextManager[Any] = nullcontext(None)
     if video is not None:
-        shown = filming(agent.env, agent.model, video, flags.verbose)
+        shown = filming(agent.env, agent.model, video)
     elif render_mode == "human":
         shown = nullcontext(partial(render, agent.env))
     asked = episodes or flags.n_timesteps or 1

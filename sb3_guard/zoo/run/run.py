@@ -654,12 +654,11 @@ class Run:
     def _advise(self) -> None:
         """Say it where a training has so few updates or episodes that little is learnt."""
         steps, model = self.hyperparams["n_timesteps"], self.model
-        if not isinstance(model, OnPolicyAlgorithm) or steps < 10_000:
-            return
+        size = model.n_envs * model.n_steps if isinstance(model, OnPolicyAlgorithm) else 0
         episode = int(time_limit(self.env) or 1)
-        updates, least = max(steps // (model.n_envs * model.n_steps), 1), 600 * episode
-        if min(updates, steps // (20 * episode)) >= 10:
+        if not size or steps < 10_000 or steps >= 10 * max(size, 20 * episode):
             return
+        updates, least = max(steps // size, 1), 600 * episode
         words = f"Only {updates} update{'s' * (updates > 1)} in {steps:,} steps"
         if length := steps // least * episode:
             how = f"-params n_envs:20 n_steps:{length} makes {steps // (20 * length)}"

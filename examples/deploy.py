@@ -1,21 +1,34 @@
-"""How do I run what ``sb3-guard export`` writes at 50 Hz, with onnxruntime alone?"""
+"""How do I run what ``sb3-guard export`` writes at 50 Hz, with onnxruntime alone?
 
+Start it beside the files; name the module that registers a robot of your own: deploy.py MODULE.
+"""
+
+import importlib
 import json
+import sys
 import time
 
 import numpy as np
-import onnxruntime
 
-import sb3_guard  # the simulation that stands in for the robot
+try:
+    import onnxruntime
 
-contract, policy = json.load(open("contract.json")), onnxruntime.InferenceSession("policy.onnx")
-period, output, bound = contract["control_step"], contract["outputs"][0], contract["costs"][0]
+    import sb3_guard  # the simulation that stands in for the robot
+
+    sys.path.append("")
+    modules = [importlib.import_module(name) for name in sys.argv[1:]]
+    contract, policy = json.load(open("contract.json")), onnxruntime.InferenceSession("policy.onnx")
+    robot = sb3_guard.make(contract["trained"]["env"], **contract["trained"].get("env_kwargs", {}))
+except Exception as error:
+    here = "start it beside policy.onnx; python deploy.py MODULE names what registers your robot"
+    raise SystemExit(f"{error}: {here}") from None
+period, output, bounds = contract["control_step"] or 0.02, contract["outputs"][0], contract["costs"]
 inputs = {part["name"]: part["shape"][1:] for part in contract["inputs"]}
 if other := inputs.keys() - {"observation", "last_cost", "noise"} | {*contract["wrappers"]}:
     raise SystemExit(f"this loop does not compute {', '.join(other)}, which contract.json names")
-assert None not in output["stop"], "say what stops the robot: sb3-guard export --stop 0:0.0"
+if None in output["stop"]:
+    raise SystemExit("say what stops the robot: sb3-guard export --stop 0:0.0")
 stop = np.array([np.nan if value == "hold" else value for value in output["stop"]], np.float32)
-robot = sb3_guard.make(contract["trained"]["env"], **contract["trained"].get("env_kwargs", {}))
 (latest, _), rng = robot.reset(seed=0), np.random.default_rng(0)
 frames = np.resize(latest, inputs["observation"])  # of a stack: the first one, repeated
 observation, missing, stops, cost, costs, sent = latest, 0, 0, 0.0, [], None
@@ -31,10 +44,14 @@ for _ in range(500):
         action, stops = np.where(np.isnan(stop), sent, stop), stops + 1  # "hold" is what was sent
     sent = np.clip(action, output["low"], output["high"])
     latest, _, terminated, truncated, info = robot.step(sent)
-    costs.append(cost := info["cost"])
+    costs.append([info[bound["name"]] for bound in bounds])
+    cost = sum(costs[-1])
     if terminated or truncated:
         (latest, _), cost = robot.reset(), 0.0
         frames = np.resize(latest, inputs["observation"])
     time.sleep(max(0.0, began + period - time.perf_counter()))
 np.savetxt("costs.csv", costs)
-print(f"cost {sum(costs):.2f}, limit {bound['limit']} per {bound['per']}; stopped {stops} times")
+for bound, each in zip(bounds, np.transpose(costs), strict=True):
+    total = max(each) if bound["per"] == "step" else sum(each)
+    print(f"{bound['name']} {total:.2f} in 500 steps, limit {bound['limit']} per {bound['per']}")
+print(f"stopped {stops} times")

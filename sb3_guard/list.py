@@ -16,7 +16,7 @@ from sb3_guard.zoo.cli.usage import import_packages
 
 def summary(part: type) -> str:
     """The first line of a part's documentation."""
-    return (part.__doc__ or "").strip().partition("\n")[0]
+    return (part.__doc__ or "").replace("``", "").strip().partition("\n")[0]
 
 
 def _of_one(suite: Suite) -> str:

@@ -70,10 +70,10 @@ def find(env_id: Any) -> Source:
     :raises gymnasium.error.DependencyNotInstalled: the package that has it is absent or too old
     """
     if hasattr(env_id, "step") and not isinstance(env_id, type):
-        name = repr(spec.id) if (spec := getattr(env_id, "spec", None)) else "MyEnv"
+        kind = type(getattr(env_id, "unwrapped", env_id)).__name__
+        name = repr(spec.id) if (spec := getattr(env_id, "spec", None)) else f"lambda: {kind}(...)"
         raise TypeError(
-            f"this {type(env_id).__name__} is made already: give an id, a class, or a function "
-            f"that makes another one, such as {name}"
+            f"this {kind} is made already: give its id or a function that makes it, such as {name}"
         )
     if callable(env_id):
         name = getattr(env_id, "__qualname__", type(env_id).__name__)

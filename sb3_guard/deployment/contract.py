@@ -26,7 +26,7 @@ from sb3_guard.deployment.environment import (
 from sb3_guard.deployment.observations import OBSERVATION, inputs_of
 from sb3_guard.spelling import did_you_mean
 
-FORMAT = 3  # increased when the content changes
+FORMAT = 4  # increased when the content changes
 HOLD = "hold"  # the last value is sent again
 _NOISE = "independent standard normal numbers, drawn anew in each step"
 _LAST_COST = "cost of the step before, 0 when an episode begins, NaN if it is not known"
@@ -50,8 +50,7 @@ def contract(
     """
     from sb3_guard import __version__
 
-    ours = ours_of(env)
-    inner = lone_of(env)
+    ours, inner, frames = ours_of(env), lone_of(env), frames_of(env)
     step = ours.engine.control_step if ours else getattr(inner and inner.unwrapped, "dt", None)
     spec = getattr(inner, "spec", None) or getattr(env.unwrapped, "spec", None)
     versions = {
@@ -71,7 +70,7 @@ def contract(
         "delay": None if ours is None else _delay(ours.engine.robot),
         "costs": list(_costs(model)),
         "filter": _filter(deployed),
-        "frame_stack": _stack(env),
+        "frame_stack": None if frames == 1 else {"frames": frames, "order": "oldest first"},
         "wrappers": [type(wrapper).__name__ for wrapper in changing(env)],
         "trained": {
             "algorithm": type(model).__name__,
@@ -115,7 +114,9 @@ def _output(name: str, model: BaseAlgorithm, env: VecEnv) -> dict[str, Any]:
             "low": [low for _, low, _ in ranges], "high": [high for _, _, high in ranges],
         }  # fmt: skip
     else:
-        described = {**_space(name, model.action_space), "dtype": _dtype(model.action_space)}
+        # exported actions are float32 whatever the space says
+        dtype = "float32" if isinstance(model.action_space, spaces.Box) else "int64"
+        described = {**_space(name, model.action_space), "dtype": dtype}
         ranges = [] if driven is None else [(part.name,) for part in driven.actuators]
     if ranges:
         described["actuators"] = [names[0] for names in ranges]
@@ -163,11 +164,6 @@ def stops(model: BaseAlgorithm, env: VecEnv, stated: Mapping[str, Any]) -> dict[
     return {"action": actions, "control": values}
 
 
-def _dtype(space: spaces.Space) -> str:
-    """Of exported actions, which are float32 whatever the space says."""
-    return "float32" if isinstance(space, spaces.Box) else "int64"
-
-
 def _space(name: str, space: spaces.Space) -> dict[str, Any]:
     """Name, type, shape and bounds of an observation or action; a bound is null if infinite."""
     shape = ["batch", *(space.shape or ())]
@@ -199,7 +195,7 @@ def _components(name: str, space: spaces.Box, env: VecEnv) -> Iterator[dict[str,
     first = parts[0].start if parts else 0
     rest = size - sum(wrapper.numbers.shape[1] for wrapper in counted.values())
     if parts and parts[-1].stop - first == rest:  # else a wrapper has changed them
-        joints_of: Any = getattr(ours.engine.robot, "joints_of", lambda name: {})
+        described = ours.engine.observer.described()
         for part in parts:
             yield {
                 "name": part.name,
@@ -208,7 +204,7 @@ def _components(name: str, space: spaces.Box, env: VecEnv) -> Iterator[dict[str,
                 "low": _finite(part.low),
                 "high": _finite(part.high),
                 "unit": part.unit,
-                **joints_of(part.name),
+                **described.get(part.name, {}),
             }
     elif rest:
         yield {"name": name, "start": 0, "stop": rest}
@@ -227,12 +223,6 @@ def _rule(wrapper: Any) -> dict[str, Any]:
             f"(its value before - {wrapper.cost_key} / {wrapper.budget:g}) / {wrapper.discount:g}"
         )
     return {"first": wrapper.first, "computed": rule}
-
-
-def _stack(env: VecEnv) -> dict[str, Any] | None:
-    """How frames are stacked."""
-    frames = frames_of(env)
-    return None if frames == 1 else {"frames": frames, "order": "oldest first"}
 
 
 def _costs(model: BaseAlgorithm) -> Iterator[dict[str, Any]]:

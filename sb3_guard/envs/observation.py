@@ -11,7 +11,7 @@ import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -143,6 +143,16 @@ class Lidar(Parameters):
     def channel(self, bodies: int, planar: bool) -> Channel:
         """What :meth:`scan` returns of a group, once flattened to [N, bodies · bins]."""
         return Channel(bodies * self.size(planar), 0.0, 1.0, "closeness")
+
+    def described(self, planar: bool) -> dict[str, Any]:
+        """What its numbers are, for a sensor that delivers the same."""
+        columns, rows = (self.bins, 1) if planar else (self.azimuth, self.elevation)
+        a, e = 360 / columns, 180 / rows
+        bins = f"azimuths from {a:g} i to {a:g} (i + 1) degrees, from x towards y"
+        up = f"; elevations from {e:g} j - 90 to {e:g} (j + 1) - 90; at {rows} i + j"
+        linear, far = f"max(0, 1 - d / {self.range or 3:g})", f"exp(-{self.gain:g} d)"
+        near = linear if self.falloff == "linear" else far
+        return {"closeness": near, "bins": bins if planar else bins + up, "alias": self.alias}
 
     def scan(self, v: Array, groups: Sequence[int] | None = None) -> Array:
         """Closeness per body, group of objects and bin.

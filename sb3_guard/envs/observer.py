@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -64,6 +65,19 @@ class Observer:
     def channels_of(self, part: Part) -> dict[str, Channel]:
         """Size, bounds and unit of what one part lets the robot observe, by name."""
         return {name: self._channel(what) for name, what in part.observations().items()}
+
+    def described(self) -> dict[str, dict[str, Any]]:
+        """What real sensors have to deliver, by component: formula, order, frames and axes."""
+        robot, found = self._robot, dict[str, dict[str, Any]]()
+        bodies: Any = getattr(robot, "sensing", None) or getattr(robot, "lidar_bodies", ())
+        for name, what in [each for part in self._parts for each in part.observations().items()]:
+            if isinstance(what, Values):
+                found[name] = getattr(robot, "described", lambda name: {})(name)
+                continue
+            said = {"direction": "v / (|v| + 0.001)"}
+            said = self._lidar.described(what.planar) if isinstance(what, Scan) else said
+            found[name] = {"frames": [*bodies], "axes": "xyz"[: self._coordinates(what)], **said}
+        return found
 
     def _channel(self, what: Scan | Compass | Values) -> Channel:
         if isinstance(what, Values):

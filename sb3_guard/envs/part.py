@@ -24,6 +24,7 @@ by :meth:`Part.current`; as an attribute it is its greatest value.
 from __future__ import annotations
 
 import math
+import re
 import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -428,6 +429,12 @@ class Constraint(Part):
     def cost(self) -> Array:
         """The cost of this step, [N], at least 0."""
         raise NotImplementedError
+
+    def per_step(self) -> str:
+        """What a step costs: the docstring from "Cost" on, with the values of ``parameters``."""
+        said = "".join(re.findall(r"\bCost\b.*", self.__doc__ or "", re.DOTALL))
+        values = {name: str(value) for name, value in vars(self).items() if value is not None}
+        return re.sub("``(.*?)``", lambda it: values.get(it[1], it[1]), " ".join(said.split()))
 
     def costs(self) -> dict[str, Array]:
         """What is reported as ``cost_<name>``, by name, [N] each; together they are the cost."""

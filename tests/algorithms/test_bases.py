@@ -135,6 +135,19 @@ def state_of_off_policy(model: Any) -> list[Any]:
     return [*(tensor.tolist() for tensor in tensors), random.getstate(), np.random.get_state()[2]]  # noqa: NPY002
 
 
+@pytest.mark.filterwarnings("ignore:rich is experimental")
+def test_the_progress_bar_shows_the_mean_cost_of_an_episode(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    shown = []
+    monkeypatch.setattr(
+        "tqdm.rich.tqdm.set_description", lambda bar, text, refresh: shown.append(text)
+    )
+    model = CPO("MlpPolicy", points(), n_steps=60, cost_limit=1.0)
+    model.learn(240, progress_bar=True)
+    assert shown == [f"cost {np.mean(model.costs.latest):.2f}"] != ["cost 0.00"]
+
+
 def test_policies_begin_calm_unless_told_otherwise(tmp_path: Path) -> None:
     """Key by key: what a user says of the networks leaves the first σ as it is."""
     for cls in (CPO, PPOLag):

@@ -250,7 +250,14 @@ def test_the_contract_of_a_robot(tmp_path: Path) -> None:
     layout = {part["name"]: slice(part["start"], part["stop"]) for part in parts}
     assert layout == engine.observation_layout
     assert parts[0] == {
-        "name": "accelerometer", "start": 0, "stop": 3, "low": None, "high": None, "unit": "m/s²"
+        "name": "accelerometer", "start": 0, "stop": 3, "low": None, "high": None, "unit": "m/s²",
+        "sensor": "accelerometer", "on": "robot", "axes": "robot",
+    }  # fmt: skip
+    assert next(part for part in parts if part["name"] == "hazards_lidar") == {
+        "name": "hazards_lidar", "start": layout["hazards_lidar"].start,
+        "stop": layout["hazards_lidar"].stop, "low": 0.0, "high": 1.0, "unit": "closeness",
+        "frames": ["robot"], "axes": "xy", "closeness": "exp(-1 d)", "alias": True,
+        "bins": "azimuths from 22.5 i to 22.5 (i + 1) degrees, from x towards y",
     }  # fmt: skip
     assert (highest["name"], highest["start"], highest["first"]) == (
         "max_cost",

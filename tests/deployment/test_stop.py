@@ -58,6 +58,7 @@ def test_a_lost_connection_does_not_move_an_arm(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["deploy.py"])
     monkeypatch.setattr("time.sleep", lambda seconds: None)
     make = sb3_guard.make
     monkeypatch.setattr(sb3_guard, "make", lambda *args, **kwargs: Watched(make(*args, **kwargs)))

@@ -26,7 +26,10 @@ SAYS = {
     "custom_algorithm": (["cost of an episode: ["], []),
     "custom_constraint": (["steps outside: ["], []),
     "custom_robot": (["26 observations, 2 actions", "return "], ["puck.xml"]),
-    "deploy": (["limit 5.0 per episode; stopped "], ["contract.json", "costs.csv", "policy.onnx"]),
+    "deploy": (
+        [", limit 5.0 per episode", "stopped "],
+        ["contract.json", "costs.csv", "policy.onnx"],
+    ),
     "several_constraints": (["return", "cost_hazards, limit 5.0", "cost_ghosts, limit 2.0"], []),
     "train_cpo": (["ep_cost_mean", ", limit 5; "], ["cpo_point.zip"]),
     "tune_with_optuna": (["0 ", "1 ", "limit"], []),
@@ -62,6 +65,7 @@ def require_rendering():
 def quick(monkeypatch, tmp_path):
     """Episodes of ten steps, a folder of one's own, and no trace of what is registered."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["example.py"])
     monkeypatch.setattr(sb3_guard.envs.suites, "EPISODE_STEPS", 10)
     for name in ("Goal_Point_8Hazards-v0", "Goal_Ant_8Hazards-v0"):
         monkeypatch.setattr(gymnasium.registry[name], "max_episode_steps", 10)
@@ -77,7 +81,8 @@ def test_every_example_is_tried_and_fits_a_page():
     assert len(SAYS) <= 8 and {path.stem for path in EXAMPLES.glob("*.py")} == {*SAYS, LONG}
     for path in EXAMPLES.glob("*.py"):
         text = path.read_text()
-        assert len(text.splitlines()) <= (180 if path.stem == LONG else 40), path.name
+        most = {LONG: 180, "deploy": 60}.get(path.stem, 40)
+        assert len(text.splitlines()) <= most, path.name
         assert re.match(r'"""How .*[?]', text), path.name
 
 
@@ -113,7 +118,7 @@ DEPLOY = (EXAMPLES / "deploy.py").read_text()
 CONTRACT = {
     "control_step": 10.0,
     "wrappers": [],
-    "costs": [{"limit": 2.0, "per": "episode"}],
+    "costs": [{"name": "cost", "limit": 2.0, "per": "episode"}],
     "frame_stack": {"frames": 3},
     "trained": {
         "env": "Goal_Point_8Hazards-v0",
@@ -175,6 +180,46 @@ def test_it_says_what_it_does_not_compute(change, words, quick, monkeypatch):
     monkeypatch.setattr(onnxruntime, "InferenceSession", Recorded)
     with pytest.raises(SystemExit, match=words):
         exec(compile(DEPLOY, "deploy.py", "exec"), {})
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [([], "No such file or directory: 'contract.json'"), (["lost"], "No module named 'lost'")],
+)
+def test_it_says_what_is_absent(argv, words, quick, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["deploy.py", *argv])
+    with pytest.raises(
+        SystemExit, match=f"{words}: start it beside policy.onnx; python deploy.py M"
+    ):
+        exec(compile(DEPLOY, "deploy.py", "exec"), {})
+
+
+def test_it_runs_a_robot_of_a_module_and_prints_each_cost_beside_its_limit(
+    quick, monkeypatch, capsys
+):
+    (quick / "my_robots.py").write_text(
+        "import sb3_guard\nworld = {'hazards': {'num': 8}, 'speed': {'limit': 0.0}}\n"
+        "sb3_guard.register('Mine-v0', sb3_guard.Scenario(constraints=world))\n"
+    )
+    monkeypatch.setattr(sys, "argv", ["deploy.py", "my_robots"])
+    env = sb3_guard.make("Goal_Point_8Hazards", speed={"limit": 0.0})
+    inputs = [{"name": "observation", "shape": ["batch", *env.observation_space.shape]}]
+    outputs = [{"name": "action", "low": [-1.0] * 2, "high": [1.0] * 2, "stop": [0.0, 0.0]}]
+    costs = [
+        {"name": "cost_hazards", "limit": 2.0, "per": "episode"},
+        {"name": "cost_speed", "limit": 0.5, "per": "step"},
+    ]
+    contract = {**CONTRACT, "trained": {"env": "Mine-v0"}, "costs": costs}
+    (quick / "contract.json").write_text(
+        json.dumps({**contract, "inputs": inputs, "outputs": outputs})
+    )
+    monkeypatch.setattr(onnxruntime, "InferenceSession", Recorded)
+    monkeypatch.setattr("time.sleep", lambda seconds: None)
+    exec(compile(shorten(DEPLOY), "deploy.py", "exec"), {})
+    hazards, speed, stopped = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"cost_hazards \d+\.\d\d in 500 steps, limit 2.0 per episode", hazards)
+    assert speed == "cost_speed 1.00 in 500 steps, limit 0.5 per step"
+    assert stopped == "stopped 0 times"
 
 
 NOTEBOOK = EXAMPLES / "quickstart.ipynb"

@@ -222,10 +222,10 @@ def test_joints_of_an_observation_are_named_in_their_order(dog):
     robot = engine.robot
     names = ["front_thigh", "front_calf", "back_thigh"]
     pose = [0.5, -1.5, 0.5]
-    assert robot.joints_of("joint_pos") == {"joints": names, "first_pose": pose}
-    assert robot.joints_of("joint_turn") == {"joints": ["fan"], "first_pose": [0.0]}
-    assert robot.joints_of("joint_vel") == {"joints": [*names, "fan"]}
-    assert robot.joints_of("gravity") == {}
+    assert robot.described("joint_pos") == {"joints": names, "first_pose": pose}
+    assert robot.described("joint_turn") == {"joints": ["fan"], "first_pose": [0.0]}
+    assert robot.described("joint_vel") == {"joints": [*names, "fan"]}
+    assert robot.described("gravity") == {"axes": "trunk"}
 
 
 def test_each_number_of_hinges_and_slides_has_its_unit(dog):
@@ -244,8 +244,8 @@ def test_each_number_of_hinges_and_slides_has_its_unit(dog):
     units = {part.name: part.unit for part in components(engine)}
     assert (units["joint_pos"], units["joint_vel"]) == ("rad, m", "rad/s, m/s")
     robot = engine.robot
-    assert robot.joints_of("joint_pos")["unit"] == ["rad", "rad", "m"]
-    assert robot.joints_of("joint_vel")["unit"] == ["rad/s", "rad/s", "m/s", "rad/s"]
+    assert robot.described("joint_pos")["unit"] == ["rad", "rad", "m"]
+    assert robot.described("joint_vel")["unit"] == ["rad/s", "rad/s", "m/s", "rad/s"]
 
 
 def test_keepout_and_arena_follow_the_size(dog):

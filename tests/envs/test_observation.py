@@ -90,6 +90,20 @@ def test_spatial_lidar_equals_the_scalar_loop(azimuth, elevation, alias):
         np.testing.assert_allclose(scan[n, b], want, atol=1e-12)
 
 
+def test_the_words_on_a_lidar_say_where_an_object_shows():
+    place = np.array([math.cos(math.radians(40)), math.sin(math.radians(40)), 0.1])
+    for planar, words, at in (
+        (True, "azimuths from 22.5 i to 22.5 (i + 1) degrees, from x towards y", 1),
+        (False, "; elevations from 30 j - 90 to 30 (j + 1) - 90; at 6 i + j", 6 * 1 + 3),
+    ):
+        lidar = Lidar(alias=False, gain=2.0)
+        said = lidar.described(planar)
+        assert said["bins"].endswith(words) and said["closeness"] == "exp(-2 d)"
+        v = place[: 2 if planar else 3]
+        seen = lidar.scan(by_coordinate(v[None, None, None]))[0, 0, 0]
+        assert seen[at] == seen.max() == pytest.approx(math.exp(-2 * np.linalg.norm(v)))
+
+
 def test_lidar_of_nothing_is_empty():
     scan = Lidar().scan(np.zeros((2, 1, 0, 3)))
     assert scan.shape == (3, 1, 1, 16) and not scan.any()

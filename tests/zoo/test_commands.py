@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import pandas as pd
 import pytest
 import yaml
 from cost_envs import CostPoint
+from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv
 from matplotlib import image
 from rl_zoo3.utils import EnvironmentName, get_model_path
@@ -21,13 +23,14 @@ from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from typed import PLAY, SMALL, TOY, require_rendering, trained
 
-from sb3_guard import CPO, cli, enjoy, train
+from sb3_guard import CPO, cli, enjoy, make_model, train
+from sb3_guard.common.monitor import CostMonitor
 from sb3_guard.envs import Scenario, register
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
 from sb3_guard.zoo.agents import playback
 from sb3_guard.zoo.cli import usage
 from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.run import Run
+from sb3_guard.zoo.run.run import Run, standing_return
 
 
 def test_track_sends_what_tensorboard_gets_and_goes_on(tmp_path, monkeypatch):
@@ -92,20 +95,27 @@ def test_costs_are_in_the_files(tmp_path):
     assert result["cost_rate"] == pytest.approx(episodes["c"].sum() / 120)
 
 
-def test_few_updates_are_told(capsys):
-    sizes = {"n_envs": 10, "n_steps": 500, "cost_limit": 1.0}
-    for steps, said in (
-        (9_000, ""),
-        (12_000, "Only 2 updates in 12,000 steps; -params n_envs:8 n_steps:50 makes 30"),
-        (60_000, ""),
+def test_few_updates_and_few_episodes_are_told(capsys):
+    """Advice keeps 20 whole episodes in an update; 600 episodes are 30 such updates."""
+    for steps, length, n_steps, said in (
+        (9_000, 1000, 500, ""),
+        (12_000, 20, 500, "Only 2 updates in 12,000 steps; -params n_envs:20 n_steps:20 makes 30"),
+        (90_000, 70, 900, ""),  # 10 updates
+        (90_000, 70, 1000, "-params n_envs:20 n_steps:140 makes 32"),
+        (60_000, 1000, 500, "60,000 steps are 60 episodes: too few; at least 600,000, 30 updates"),
+        (60_000, 1000, 25, "60,000 steps are 60 episodes: too few; at least 600,000, 30 updates"),
+        (60_000, 20, 500, ""),
     ):
         given = {"env": "CostPoint-v0", "gym_packages": ["registered_envs"]}
-        run = Run.check(RunFlags.of({**given, "n_timesteps": steps, "hyperparams": sizes})).make()
+        sizes = {"n_envs": 10, "n_steps": n_steps, "cost_limit": 1.0}
+        given |= {"n_timesteps": steps, "hyperparams": sizes}
+        given["env_kwargs"] = {"max_episode_steps": length}
+        run = Run.check(RunFlags.of(given)).make()
         capsys.readouterr()
         run._advise()
         run.close()
         out = capsys.readouterr().out
-        assert said in out and bool(said) == bool(out)
+        assert said in out and bool(said) == bool(out), (steps, length, out)
 
 
 def test_no_episode_ends(tmp_path, capsys):
@@ -334,6 +344,56 @@ def test_a_run_is_of_the_latest_version_where_none_is_given(tmp_path, name, vers
     assert playback.find_run(tmp_path, "cpo", name).path.name == f"{name}-v{version}_1"
 
 
+def test_the_only_algorithm_that_has_runs_is_taken_and_several_are_listed(tmp_path):
+    def runs(algo):
+        (tmp_path / algo / "CostPoint-v0_2" / "CostPoint-v0").mkdir(parents=True)
+        (tmp_path / algo / "CostPoint-v0_2" / "CostPoint-v0" / "args.yml").touch()
+        return playback.only_algorithm(str(tmp_path), "CostPoint", "cpo")
+
+    assert playback.only_algorithm(str(tmp_path), "CostPoint", "cpo") == "cpo"
+    assert runs("pcpo") == "pcpo"
+    with pytest.raises(
+        usage.UsageError, match="has runs of CostPoint by pcpo, sac_lag: add --algo"
+    ):
+        runs("sac_lag")
+
+
+def test_an_environment_without_a_time_limit_is_warned_about_before_training(recwarn):
+    for given, warned in ({}, True), ({"max_episode_steps": 5}, False):
+        recwarn.clear()
+        make_model("cpo", CostPoint, cost_limit=1.0, n_envs=2, n_steps=10, env_kwargs=given)
+        said = [str(each.message) for each in recwarn]
+        assert any(each.startswith("cost_envs.CostPoint states no") for each in said) == warned
+
+
+class Rewarding(CostPoint):
+    """Rewards the length of the action."""
+
+    def step(self, action):
+        observation, _, *rest = super().step(action)
+        return observation, float(np.linalg.norm(action)), *rest
+
+
+@pytest.mark.parametrize("low, standing", [(-1.0, 0.0), (0.6, 5 * 0.6 * 2**0.5)])
+def test_an_agent_that_does_no_better_than_standing_still_is_told(low, standing, capsys):
+    def make():
+        env = Rewarding(episode_length=5)
+        env.action_space = spaces.Box(low, 1.0, (2,), np.float32)
+        return env
+
+    env = CostMonitor(DummyVecEnv([make, make]))
+    assert standing_return(env) == pytest.approx(standing)
+    run = Run(RunFlags.of({"seed": 0}))
+    for better in (0.1, 0.0):
+        certificate = SimpleNamespace(mean_return=standing + better)
+        run.delivery = SimpleNamespace(certificate=certificate, eval_env=env)
+        run._beside_standing()
+        said = f"no better than standing still, of return {standing:.4g} in one episode"
+        assert (said in capsys.readouterr().out) == (not better)
+    env.action_space = spaces.Discrete(2)
+    assert standing_return(env) is None
+
+
 def test_show_prints_an_environment_and_draws_it(tmp_path, monkeypatch, capsys):
     require_rendering()
     monkeypatch.chdir(tmp_path)
@@ -346,7 +406,8 @@ def test_show_prints_an_environment_and_draws_it(tmp_path, monkeypatch, capsys):
     assert ["accelerometer", "0:3", "[-inf, inf]", "m/s²"] in cells
     costs = text.split("\n\n")[1].splitlines()
     assert costs[0].startswith("info['cost_ghosts']: Zones that follow the robot")
-    assert costs[1:] == [
+    assert costs[1].startswith("    Cost: 1.0 · Σ max(0, size − distance), m, over the ghosts")
+    assert costs[2:] == [
         "Usual cost limit of an episode: 2.", "An episode has 1000 steps of 0.2 s."
     ]  # fmt: skip
     assert ["ghosts_lidar", "3:19", "[0, 1]", "closeness"] in cells
@@ -354,7 +415,8 @@ def test_show_prints_an_environment_and_draws_it(tmp_path, monkeypatch, capsys):
     assert [row[1] for row in cells[-8:]] == [
         f"{j}_{i}" for i in (1, 2, 3, 4) for j in ("hip", "ankle")
     ]
-    assert text.endswith("wrote Goal_Ant_8Ghosts.png\n")
+    took = r"A million steps take \d+\.\d min on this machine, without learning\."
+    assert re.search(took + "\nwrote Goal_Ant_8Ghosts.png\n$", text)
     frame = image.imread(tmp_path / "Goal_Ant_8Ghosts.png")[..., :3]
     red, green, blue = np.moveaxis(frame, -1, 0)
     assert ((red - green > 0.25) & (blue > green)).sum() > 1000  # ghosts
@@ -366,7 +428,15 @@ def test_show_knows_what_users_registered(tmp_path, request, capsys):
     request.addfinalizer(lambda: gymnasium.registry.pop("TwoPits-v0", None))
     register("TwoPits-v0", Scenario(constraints={"pits": {"type": "hazards", "num": 2}}))
     assert cli.main(["show", "TwoPits-v0", "-o", str(tmp_path / "pits.png")]) == 0
-    assert "pits_lidar" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "pits_lidar" in out and "\nNo cost limit is usual here: choose cost_limit.\n" in out
+    words = ["show", "-o", str(tmp_path / "x.png"), "--gym-packages", "registered_envs"]
+    assert cli.main([*words, "TwoPits-v0"]) == 0
+    capsys.readouterr()
+    assert cli.main(words) == 2
+    assert (
+        capsys.readouterr().err == "error: name an environment: sb3-guard show Goal_Ant_8Ghosts\n"
+    )
     assert cli.main(["show", "CartPole-v1"]) == 2
     assert "'CartPole-v1' is not an environment of sb3_guard's" in capsys.readouterr().err
     assert cli.main(["show", "goal_ant_8ghosts"]) == 2

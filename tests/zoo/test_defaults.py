@@ -4,6 +4,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import registered_envs  # noqa: F401  an environment with an id
@@ -170,8 +171,12 @@ def test_make_model_takes_a_class_or_a_function() -> None:
             make_model("cpo", mine)
     with pytest.raises(ValueError, match=r"can.t make cost_envs\.CostPoint: "):
         make_model("cpo", CostPoint, cost_limit=1.0, env_kwargs={"size": 2})
-    with pytest.raises(TypeError, match="this CostPoint is made already"):
-        make_model("cpo", CostPoint())
+    for env, name in (
+        (CostPoint(), r"lambda: CostPoint\(...\)"),
+        (gym.make("CostPoint-v0"), "'CostPoint-v0'"),
+    ):
+        with pytest.raises(TypeError, match=f"made already: give its id or a function .* {name}"):
+            make_model("cpo", env)
 
 
 def test_arguments_of_a_part_join_those_of_the_file() -> None:

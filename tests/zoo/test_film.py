@@ -59,11 +59,12 @@ def test_a_line_stands_above_the_picture():
     assert (shown[:16].min(axis=2) < 150).sum() > 20  # it is written
 
 
-def test_a_film_has_a_picture_a_step(tmp_path):
-    venv = CostMonitor(DummyVecEnv([lambda: Filmed("rgb_array", episode_length=8)]))
+def test_a_film_has_a_picture_a_step_and_says_how_far_it_is(tmp_path, capsys):
+    venv = CostMonitor(DummyVecEnv([lambda: Filmed("rgb_array", episode_length=208)]))
     with filming(venv, None, tmp_path / "film.mp4") as film:
         venv.reset()
-        for _ in range(8):
+        for _ in range(208):
             venv.step(np.zeros((1, 2)))
             film()
-    assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))[0] == 7
+    assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))[0] == 207
+    assert capsys.readouterr().err == "filmed 100 steps\nfilmed 200 steps\n"

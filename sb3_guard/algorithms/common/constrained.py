@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
@@ -34,6 +34,15 @@ BROKEN_OFF = (
     "eval_env is the training environment, whose episodes every evaluation would break off: make "
     "another one for it"
 )
+
+
+class CostBar(ProgressBarCallback):
+    """SB3's progress bar, with the mean costs of the latest episodes."""
+
+    def _on_rollout_end(self) -> None:
+        if latest := self.model.costs.latest:  # type: ignore[attr-defined]
+            means = map("{:.2f}".format, np.mean(latest, axis=0))
+            self.pbar.set_description(f"cost {', '.join(means)}", refresh=False)
 
 
 class Constrained(BaseAlgorithm):
@@ -234,9 +243,13 @@ class Constrained(BaseAlgorithm):
         theirs = inspect.signature(super().learn)  # type: ignore[safe-super]
         if tb_log_name == theirs.parameters["tb_log_name"].default:
             tb_log_name = type(self).__name__
-        return super()._setup_learn(
+        total, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
+        if progress_bar:
+            bar = callback.callbacks[-1] = CostBar()  # type: ignore[attr-defined]
+            bar.init_callback(self)
+        return total, callback
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> Any:
         """

@@ -13,7 +13,7 @@ ENDLESS = 50.0  # m, how far a line is drawn that has no end
 
 @dataclass
 class Boundary(Constraint):
-    """Cost 1 while the robot is outside lines at ±x or ±y (Ji et al. 2023).
+    """Cost 1 while the robot is outside lines at ±``x`` or ±``y`` m (Ji et al. 2023).
 
     None means no boundary.
     """

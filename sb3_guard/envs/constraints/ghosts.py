@@ -16,9 +16,9 @@ class Ghosts(Movers, Obstacles):
     """Zones that follow the robot until they are within r1 of it (Zhao et al. 2024, §4.3).
 
     Farther than r0 from the origin, a ghost returns to it at v0; otherwise it approaches the robot
-    at v1 until it is within r1, and waits there. Cost: Σ max(0, size − distance) over the ghosts,
-    where the distance is from the ghost's centre to the robot's position, or to the nearest link of
-    an arm (in the plane for ghosts on the floor). Of solid ghosts: the number touched.
+    at v1 until it is within r1, and waits there. Cost: ``weight`` · Σ max(0, size − distance), m,
+    over the ghosts, where the distance is from the centre to the robot's position, or to the
+    nearest link of an arm (in the plane for those on the floor). Of solid ones: the number touched.
     """
 
     name = "ghosts"

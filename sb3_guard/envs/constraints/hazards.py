@@ -11,8 +11,8 @@ from sb3_guard.envs.part import HEIGHT, SPACE, Simulation
 class Hazards(Obstacles):
     """Zones to keep out of: discs on the floor, or spheres in the air (Zhao et al. 2024, §4.3).
 
-    Cost: Σ max(0, size − distance) over the zones, where the distance is from the zone's centre to
-    the robot's position, or to the nearest link of an arm (in the plane for discs).
+    Cost: ``weight`` · Σ max(0, size − distance), m, over the zones, where the distance is from the
+    centre to the robot's position, or to the nearest link of an arm (in the plane for discs).
     """
 
     name = "hazards"

@@ -50,7 +50,7 @@ class Limit(Constraint):
 class BaseHeight(Limit):
     """The robot neither falls nor jumps.
 
-    Cost ``weight`` in each step at whose end its position is below ``low`` or above ``high``.
+    Cost ``weight`` in each step at whose end its position is below ``low`` or above ``high`` m.
     """
 
     name = "baseheight"
@@ -147,7 +147,7 @@ class JointLimit(RobotLimit):
 class JointSpeed(JointLimit):
     """Joints turn slowly.
 
-    Cost ``weight`` in each step at whose end a joint is faster than ``limit``.
+    Cost ``weight`` in each step at whose end a joint is faster than ``limit`` rad/s.
     """
 
     name = "jointspeed"
@@ -161,7 +161,7 @@ class JointSpeed(JointLimit):
 class JointTorque(JointLimit):
     """Actuators are not strained.
 
-    Cost ``weight`` in each step at whose end actuators exert more than ``limit`` on a joint.
+    Cost ``weight`` in each step at whose end actuators exert over ``limit`` N m on a joint.
     """
 
     name = "jointtorque"
@@ -201,8 +201,8 @@ class JointLimits(JointLimit):
 class BaseTilt(RobotLimit):
     """The outermost body stays upright.
 
-    Cost ``weight`` in each step at whose end it leans by more than ``limit`` from how it stands in
-    the file.
+    Cost ``weight`` in each step at whose end it leans by more than ``limit`` rad from how it
+    stands in the file.
     """
 
     name = "basetilt"
@@ -229,8 +229,8 @@ class BaseTilt(RobotLimit):
 class FloorContact(RobotLimit):
     """Bodies of the robot do not lean on the floor.
 
-    Cost ``weight`` in each step at whose end the floor pushes one of ``bodies`` with more than
-    ``limit``.
+    Cost ``weight`` in each step at whose end the floor pushes one of its bodies with more than
+    ``limit`` N.
     """
 
     name = "floorcontact"
@@ -268,7 +268,7 @@ class SelfCollision(RobotLimit):
     """The robot does not hit itself.
 
     Cost ``weight`` in each step at whose end two of its bodies press on each other with more than
-    ``limit``.
+    ``limit`` N.
     """
 
     name = "selfcollision"

@@ -59,6 +59,9 @@ class Obstacles(Placed, Constraint):
         depth = self._sizes - self.sim.robot.clearance(self.group.centers, self.planar)
         return self.weight * np.maximum(depth, 0.0)
 
+    def per_step(self) -> str:
+        return "Cost 1 in a step with any." if self.indicator else super().per_step()
+
     def cost(self) -> Array:
         amounts = self.amounts()
         if self.indicator:

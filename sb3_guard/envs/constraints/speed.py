@@ -11,7 +11,7 @@ from sb3_guard.envs.types import Array, Generators
 
 @dataclass
 class Speed(Constraint):
-    """Cost 1 in each step in which the robot is faster than ``limit`` (Zhang et al. 2020).
+    """Cost 1 in each step in which the robot is faster than ``limit`` m/s (Zhang et al. 2020).
 
     The speed is the distance covered in the control step, divided by its duration.
     """

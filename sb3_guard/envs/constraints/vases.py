@@ -19,8 +19,8 @@ from sb3_guard.envs.types import Array
 class Vases(Obstacles):
     """Boxes that slide when pushed (Ray et al. 2019).
 
-    Cost, summed over the vases: ``weight`` for each touched, ``displacement_weight`` times its
-    distance from its place and ``velocity_weight`` times its speed, where above the thresholds.
+    Cost, summed over the vases: ``weight`` for each touched, ``displacement_weight`` for a metre
+    from its place and ``velocity_weight`` for 1 m/s, where above the thresholds.
     """
 
     name = "vases"

@@ -413,16 +413,17 @@ class MJCFRobot(Robot):
                 return Values(-self._axes[:, 2], -1.0, 1.0, "direction")
         return Values(self._last, unit="action")
 
-    def joints_of(self, name: str) -> dict[str, list[Any]]:
-        """The joints of a computed observation in its order, for the loop around a policy.
+    def described(self, name: str) -> dict[str, Any]:
+        """What an observation measures, for the loop around a policy.
 
-        :param name: of the observation
-        :return: ``joints``, of positions ``first_pose``, qpos that they are relative to, rad or m,
-            and of hinges with slides ``unit``, that of each number; empty of other observations
+        :return: ``sensor``, ``on`` and ``axes``; of joints ``joints``, ``first_pose``, qpos that
+            positions are relative to, rad or m, and ``unit`` of each number where these differ
         """
-        if not self.aware or name not in self._numbers or name not in self._senses:
-            return {}
         model = self.sim.model
+        if name not in self._senses:
+            return sensors.described(model, self._prefix + name, self._prefix)
+        if name not in self._numbers:
+            return {"axes": self.root.removeprefix(self._prefix)} if name != "last_action" else {}
         names = [model.joint(i).name.removeprefix(self._prefix) for i, _ in self._numbers[name]]
         joints: dict[str, list[Any]] = {"joints": names}
         if len(set(self._units[name])) > 1 and name != "joint_turn":

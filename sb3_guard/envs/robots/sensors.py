@@ -60,6 +60,19 @@ def bounds(model: mujoco.MjModel, name: str) -> tuple[float, float, str]:
     return 0.0 if kind == _SENSOR.mjSENS_TOUCH else -math.inf, math.inf, unit
 
 
+def described(model: mujoco.MjModel, name: str, prefix: str) -> dict[str, str]:
+    """Type of a sensor, what it is on, and along whose axes it measures, by these names."""
+    if (i := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)) < 0:
+        return {}
+    it = model.sensor(i)
+    on, axes = (
+        (mujoco.mj_id2name(model, kind[0], number[0]) or "world").removeprefix(prefix)
+        for kind, number in ((it.objtype, it.objid), (it.reftype, it.refid))
+    )
+    kind = _SENSOR(int(model.sensor_type[i])).name[7:].lower()
+    return {"sensor": kind, "on": on, "axes": axes if kind[:5] in ("frame", "subtr") else on}
+
+
 def bodies(model: mujoco.MjModel, sensor: int) -> set[int]:
     """The bodies that a sensor is on or relates something to."""
     found = set()

@@ -4,6 +4,7 @@ Gymnasium's and SB3's recorders keep all pictures of an episode in memory, some 
 at this size; here each is written as it is taken.
 """
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -81,9 +82,11 @@ def filming(env: VecEnv, model: BaseAlgorithm | None, video: Path) -> Iterator[C
         writer.send(None)
 
         def film() -> None:
-            if find_monitor(env).episodes.lengths[0]:  # else it is of the next episode by now
+            if steps := find_monitor(env).episodes.lengths[0]:  # else it is of the next by now
                 picture: Any = render(env)
                 writer.send(np.ascontiguousarray(below(caption(env, model), picture)))
+                if steps % 100 == 0:
+                    print(f"filmed {steps} steps", file=sys.stderr)
 
         with closing(writer):
             yield film

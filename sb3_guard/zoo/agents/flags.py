@@ -13,7 +13,7 @@ class AgentFlags(Command):
 
     Which agent:
 
-    :param algo: algorithm (default: cpo)
+    :param algo: algorithm (default: the only one that has a run of --env, else cpo)
     :param env: environment id (default: Goal_Point_8Hazards)
     :param folder: log folder, or the folder of a run, without --algo and --env (default: logs)
     :param exp_id: number of the run; 0: the latest, -1: <folder>/<algo> itself is the run (default:

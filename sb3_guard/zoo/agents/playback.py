@@ -63,6 +63,15 @@ def find_run(
     )
 
 
+def only_algorithm(folder: str, env_id: str, default: str) -> str:
+    """The algorithm that has runs of an environment; raises UsageError where several have."""
+    name = folder_name(with_version(env_id))
+    algos = sorted(path.name for path in Path(folder).glob("*") if latest_run(path, name))
+    if len(algos) > 1:
+        raise UsageError(f"{folder!r} has runs of {env_id} by {', '.join(algos)}: add --algo")
+    return algos[0] if algos else default
+
+
 def find_model(run: RunFolder, flags: AgentFlags) -> tuple[Path, Path]:
     """
     The model that the flags ask for, and where its observation statistics are, if it has any.
@@ -172,6 +181,8 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
         with explained(f"{run.params / 'args.yml'} is damaged"):
             flags.algo, flags.env = (str(run.args()[name]) for name in ("algo", "env"))
     else:
+        if "algo" not in flags.given:
+            flags.algo = only_algorithm(flags.folder, flags.env, flags.algo)
         run = find_run(flags.folder, flags.algo, flags.env, flags.exp_id, flags.gym_packages)
     filed = RunFlags.read({"gym_packages": run.args().get("gym_packages")}, run.path)
     require_named(run.path, flags, filed, "gym_packages")

@@ -139,7 +139,8 @@ def require_named(where: object, given: "Command", filed: "Command", *names: str
     for name in names:
         value = getattr(filed, name)
         if value and value != PAPER and not getattr(given, name):
+            look = ", ".join(value) if isinstance(value, list) else f"its {name}"
             raise UsageError(
-                f"{where} needs {name}, which only the command line may name; look at that, then "
+                f"{where} needs {name}, which only the command line may name; look at {look}, then "
                 f"add {shlex.join(filed.words({name}))}"
             )

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from multiprocessing.util import register_after_fork
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Self
 
 import gymnasium as gym
@@ -454,6 +455,9 @@ class Run:
             th.set_num_threads(flags.num_threads)
         set_random_seed(flags.seed)
         env = self.make_envs(self.hyperparams["n_envs"], flags.seed)
+        if time_limit(env) is None:
+            advice = "env_kwargs max_episode_steps:1000 sets one, if its episodes do not end"
+            warnings.warn(f"{flags.env} states no time limit: {advice}", stacklevel=2)
         try:
             model = self._make_model(env)
             seed_rows(env, flags.seed)
@@ -656,21 +660,34 @@ class Run:
             print(f"{words} at {result['n_timesteps']:,} steps, {seconds:.0f} s")
             print(f"  last epoch         {summary(result)}\n  run folder         {folder.path}")
             if finished:
+                self._beside_standing()
                 print(f"  see the agent      {folder.play(flags)}")
             else:
                 print(f"  continue with      {folder.again(flags)}")
         return 0 if finished else 128 + (received or [signal.SIGTERM])[0]
 
     def _advise(self) -> None:
-        """Say it where a training has so few updates that little is learnt."""
+        """Say it where a training has so few updates or episodes that little is learnt."""
         steps, model = self.hyperparams["n_timesteps"], self.model
-        if isinstance(model, OnPolicyAlgorithm) and steps >= 10_000:
-            updates = max(steps // (model.n_envs * model.n_steps), 1)
-            if updates < 10:
-                print(
-                    f"Only {updates} update{'s' * (updates > 1)} in {steps:,} steps; "
-                    f"-params n_envs:8 n_steps:{steps // 240} makes 30"
-                )
+        size = model.n_envs * model.n_steps if isinstance(model, OnPolicyAlgorithm) else 0
+        episode = int(time_limit(self.env) or 1)
+        if not size or steps < 10_000 or steps >= 10 * max(size, 20 * episode):
+            return
+        updates, least = max(steps // size, 1), 600 * episode
+        words = f"Only {updates} update{'s' * (updates > 1)} in {steps:,} steps"
+        if length := steps // least * episode:
+            how = f"-params n_envs:20 n_steps:{length} makes {steps // (20 * length)}"
+        else:
+            words = f"{steps:,} steps are {steps // episode:,} episodes: too few"
+            how = f"at least {least:,}, 30 updates of 20 episodes"
+        print(f"{words}; {how}")
+
+    def _beside_standing(self) -> None:
+        """Say it where a delivered agent does no better than one that does nothing."""
+        if self.delivery and (certificate := self.delivery.certificate):
+            standing = standing_return(self.delivery.eval_env, evaluation_seed(self.flags.seed))
+            if standing is not None and certificate.mean_return <= standing:
+                print(f"  no better than standing still, of return {standing:.4g} in one episode")
 
     def _checkpoints(
         self, folder: RunFolder, epochs: Epochs, asked_to_stop: Callable[[], bool]
@@ -789,6 +806,16 @@ def _data(played: Evaluation) -> dict[str, Any]:
         bounded = zip(played.cost_keys, played.limited.T, strict=True)
         data["bounded"] = {key: rounded(costs) for key, costs in bounded}
     return data
+
+
+def standing_return(env: VecEnv, seed: int = 0) -> float | None:
+    """The return of an episode of actions 0, or the nearest to it; None: there is no such."""
+    if not isinstance(space := env.action_space, spaces.Box):
+        return None
+    still = np.array([np.clip(np.zeros(space.shape), space.low, space.high)] * env.num_envs)
+    policy: Any = SimpleNamespace(predict=lambda *args, **kwargs: (still, None))
+    returns = evaluate_policy(policy, env, 1, seed=seed).returns
+    return float(returns[0]) if len(returns) else None
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:

@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, suppress
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from multiprocessing.util import register_after_fork
 from pathlib import Path
 from typing import Any, Self
@@ -75,8 +75,10 @@ from sb3_guard.zoo.run.hyperparams import (
     check,
     merged,
     model_arguments,
+    nearest,
     normalization,
     read_hyperparams,
+    usual_limit,
     without_withdrawn,
 )
 from sb3_guard.zoo.run.logger import RunLogger, cut
@@ -92,6 +94,7 @@ from sb3_guard.zoo.run.progress import Epochs, summary
 
 FINAL_EPISODES = 100  # of each policy, after training
 DELIVERY_ENVS = 50  # in which candidates are screened and certified
+say_once = cache(print)  # a line that is the same for many runs of a grid
 WANDB = "wandb.txt"  # beside the run's configuration: its id at Weights & Biases
 
 
@@ -197,12 +200,21 @@ class Run:
             flags.seed = int(np.random.default_rng().integers(2**31))
         values = read_hyperparams(flags.algo, flags.env, flags.conf_file, flags.overrides())
         values = run.hyperparams = check(flags.algo, algo, values)
+        base = nearest(flags.algo, flags.conf_file)
+        if flags.verbose and base != flags.algo:
+            say_once(f"hyperparameters of {flags.algo}: those of {base}")
         if run.constrained and "cost_limit" not in values:
-            raise UsageError(
-                f"no cost limit is known for {flags.env}: give cost_limit, the highest cost of an "
-                "episode that you accept, such as half of what an episode costs PPO "
-                "(-params cost_limit:25)"
-            )
+            other = "cost_keys" in values or getattr(algo, "limit_on", "sum") == "max"
+            limit = None if other else usual_limit(flags.env)
+            if limit is None:
+                raise UsageError(
+                    f"no cost limit is known for {flags.env}: give cost_limit, the highest cost of "
+                    "an episode that you accept, such as half of what an episode costs PPO "
+                    "(-params cost_limit:25)"
+                )
+            values["cost_limit"] = limit
+            if flags.verbose:
+                say_once(f"cost_limit of {flags.algo} on {flags.env}: {limit:g}, the usual one")
         if flags.env_kwargs:
             values["env_kwargs"] = merged(values.get("env_kwargs") or {}, flags.env_kwargs)
         # What wraps single environments needs single ones.
@@ -641,9 +653,9 @@ class Run:
             print(f"{words} at {result['n_timesteps']:,} steps, {seconds:.0f} s")
             print(f"  last epoch         {summary(result)}\n  run folder         {folder.path}")
             if finished:
-                print(f"  see the agent      {folder.play(flags)}")
+                print(f"  see the agent      {folder.play()}")
             else:
-                print(f"  continue with      {folder.again(flags)}")
+                print(f"  continue with      {folder.again()}")
         return 0 if finished else 128 + (received or [signal.SIGTERM])[0]
 
     def _advise(self) -> None:
@@ -713,7 +725,7 @@ class Run:
                 return False
             raise UsageError(
                 f"a process of --vec-env {self.flags.vec_env} has died, by an error told above, a "
-                f"signal or for lack of memory; continue with: {folder.again(self.flags)}"
+                f"signal or for lack of memory; continue with: {folder.again()}"
             ) from error
         return True
 

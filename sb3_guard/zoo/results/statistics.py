@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import ttest_ind
 
+from sb3_guard.algorithms import CLASSES
 from sb3_guard.costs import bounded_name, verdict
 from sb3_guard.zoo.results.runs import REFERENCE, read_episodes
 from sb3_guard.zoo.run.folder import EPOCH, PLAYED
@@ -228,6 +229,7 @@ def differences(runs: pd.DataFrame) -> pd.DataFrame:
         pair = [seeds for _, seeds in group.groupby("algo", sort=False)][::-1]
         if len(pair) != 2:
             continue
+        pair.sort(key=lambda seeds: seeds["algo"].iloc[0] in CLASSES)  # a user's less ours
         played = [[*map(read_splits, seeds["path"], seeds["epoch"])] for seeds in pair]
         shared = set(SPLITS).intersection(*(splits for seeds in played for splits in seeds))
         split = "stochastic" if "stochastic" in shared else "training"

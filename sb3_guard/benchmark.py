@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.flags import command, flag
-from sb3_guard.zoo.cli.usage import UsageError, read_mapping
+from sb3_guard.zoo.cli.usage import UsageError, import_packages, read_mapping
 from sb3_guard.zoo.run.flags import EvaluationFlags, RunFlags, TrainingFlags
 
 # Flags that no grid file states
@@ -127,6 +127,7 @@ def benchmark(flags: Flags) -> int:
 
     from sb3_guard.zoo.grids.grid import expand, run_grid, summary
 
+    import_packages(flags.gym_packages)  # which may register algorithms
     runs = expand(flags.pairs(), flags.seeds, of_a_run, flags.scale)
     if flags.dry_run:
         for run in runs:

@@ -44,6 +44,7 @@ class Flags(Command):
   sb3-guard plot logs                                   learning curves, tables on the terminal
   sb3-guard plot logs --figure q3 q4 pareto -o figures --format png pdf
   sb3-guard plot logs --figure all --table results.md results.csv --report report.html
+  sb3-guard plot logs/ppo_lag logs/mine                 of two algorithms the difference, too
   sb3-guard plot logs more_logs --env Goal_Point_8Hazards --cost-limit 5
 
 figures:
@@ -88,15 +89,17 @@ def plot(flags: Flags) -> int:
     by_default = not (flags.figure or flags.table or flags.report)
     if not (means or flags.figure or flags.report or by_default):
         return 0
-    runs = reading.select(chosen)
-    data = Data(runs)
+    shorter = reading.shorter(chosen)
+    for path, why in shorter.items():
+        print(f"left out: {path}: {why}", file=sys.stderr)
+    data = Data(reading.select(chosen[~chosen["path"].isin(shorter)]))
     for file in means:
         tables.write_tables(file, data)
         print(f"wrote {file}")
     _draw(data, ["curves"] if by_default else flags.figure, flags)
     if flags.report:
         title = f"Safe reinforcement learning: {', '.join(flags.folders)}"
-        page = page_of(data, title, results.left_out)
+        page = page_of(data, title, results.left_out | shorter)
         with tables.written(Path(flags.report)) as handle:
             handle.write(page.encode())
         print(f"wrote {flags.report}")

@@ -25,7 +25,7 @@ from sb3_guard.list import summary
 from sb3_guard.zoo.cli.flags import Command, command, flag
 from sb3_guard.zoo.cli.markdown import table
 from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages
-from sb3_guard.zoo.run.hyperparams import entry, read_file, shipped_file
+from sb3_guard.zoo.run.hyperparams import usual_limit
 
 
 def observation_table(env: GuardVectorEnv) -> str:
@@ -73,8 +73,9 @@ def costs(env: GuardVectorEnv, env_id: str | None) -> Iterator[str]:
     how = "1 if any of these costs" if env.scenario.cost == "any" else "their sum"
     if len(parts) > 1:
         yield f"info['cost']: {how}."
-    if env_id in env_ids() and (values := entry(read_file(shipped_file("cpo")), env_id)):
-        yield f"Usual cost limit of an episode: {values['cost_limit']:g}."
+    limit = usual_limit(env_id) if env_id in env_ids() else None
+    if limit is not None and parts:
+        yield f"Usual cost limit of an episode: {limit:g}."
     elif parts:
         yield "No cost limit is usual here: choose cost_limit."
     steps = env.max_episode_steps

@@ -1,7 +1,6 @@
 """The bases carry algorithms of anyone's: PPO-Lagrangian as the example has it, SAC with costs."""
 
 import inspect
-import json
 import random
 from pathlib import Path
 from typing import Any
@@ -14,11 +13,9 @@ from ppo_lagrangian import PPOLagrangian
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_guard import train
 from sb3_guard.algorithms import (
     ALGORITHMS,
     CPO,
-    TRPO,
     Constrained,
     FirstOrder,
     PPOLag,
@@ -26,8 +23,6 @@ from sb3_guard.algorithms import (
     register_algorithm,
 )
 from sb3_guard.algorithms.common.first_order import mean_kl
-
-EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 def points(n_envs: int = 4, **kwargs: Any) -> Any:
@@ -183,27 +178,6 @@ def test_defaults_are_stated_where_only_they_differ() -> None:
 
 
 # Algorithms from outside the package
-
-
-def test_a_users_algorithm_trains_by_command(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Registered by a module of the user's, with hyperparameters from there."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setitem(ALGORITHMS, "trpo_price", TRPO)  # to be forgotten afterwards
-    del ALGORITHMS["trpo_price"]
-    path = tmp_path / "my_algorithm.py"
-    path.write_text((EXAMPLES / "custom_algorithm.py").read_text())
-    command = (
-        "--gym-packages my_algorithm --algo trpo_price --verbose 0 -conf my_algorithm.py "
-        "--env Goal_Point_8Hazards -n 80 --eval-freq -1 --seed 0 "
-        "-params n_envs:2 n_steps:20 n_critic_updates:1"
-    )
-    assert train.main(command.split()) == 0
-    run = tmp_path / "logs" / "trpo_price" / "Goal_Point_8Hazards-v0_1"
-    result = json.loads((run / "result.json").read_text())
-    assert (result["n_timesteps"], result["cost_limit"]) == (80, 5.0)
 
 
 def test_what_can_be_registered(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -92,6 +92,7 @@ def test_the_guides_samples_run_in_order(guide, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for env_id in ("Goal_Point_8Hazards-v0", "SafetyPointGoal1-v0"):
         monkeypatch.setattr(gymnasium.registry[env_id], "max_episode_steps", 20)
+    monkeypatch.setattr("sb3_guard.algorithms.ALGORITHMS", dict(sb3_guard.ALGORITHMS))
     blocks = python_blocks(guide)
     assert blocks
     names = {"gymnasium": gymnasium}

@@ -237,6 +237,14 @@ def choose(
     return runs.reset_index(drop=True)
 
 
+def shorter(runs: pd.DataFrame) -> dict[str, str]:
+    """By its path, the length of a run of whose algorithm and environment there is a longer one."""
+    longest = runs.groupby(["suite", "algo"])["steps"].transform("max")
+    short = runs[runs["steps"] < longest]
+    why = "{:,} steps, where the longest run of this algorithm here has {:,}".format
+    return dict(zip(short["path"], map(why, short["steps"], longest[short.index]), strict=True))
+
+
 def _names(suite: str) -> set[str]:
     """An environment with and without its version."""
     return {suite, f"{suite}-v0", re.sub(r"-v\d+$", "", suite)}

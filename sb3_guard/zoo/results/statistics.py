@@ -6,12 +6,15 @@ Agents are judged by three kinds of episodes; share of violations, D⁺ and verd
 
 import json
 import math
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from scipy.stats import ttest_ind
 
+from sb3_guard.algorithms import CLASSES
 from sb3_guard.judging import kept, named
 from sb3_guard.zoo.results.runs import REFERENCE, read_episodes
 from sb3_guard.zoo.run.folder import EPOCH, PLAYED
@@ -209,6 +212,44 @@ def mean_curve(curves: Sequence[pd.DataFrame], name: str) -> pd.DataFrame:
     table = pd.concat(columns, axis=1).sort_index().interpolate(method="index", limit_area="inside")
     table = table.dropna()
     return pd.DataFrame({"mean": table.mean(axis=1), "std": table.std(axis=1)})
+
+
+def differences(runs: pd.DataFrame) -> pd.DataFrame:
+    """
+    How far apart two algorithms are, a row per environment that has runs of exactly two.
+
+    The 95 % intervals are Welch's, of the seeds' means. A bootstrap of so few seeds is too narrow:
+    of two against two it has nine values in all.
+
+    :return: ``suite``, ``label`` ("one − other"), ``split``, ``seeds``, ``steps``, and the
+        differences ``return`` and ``cost`` with ``_low`` and ``_high`` (NaN for a single seed)
+    """
+    rows = []
+    for suite, group in runs.groupby("suite", sort=False):
+        pair = [seeds for _, seeds in group.groupby("algo", sort=False)][::-1]
+        if len(pair) != 2:
+            continue
+        pair.sort(key=lambda seeds: seeds["algo"].iloc[0] in CLASSES)  # a user's less ours
+        played = [[*map(read_splits, seeds["path"], seeds["epoch"])] for seeds in pair]
+        shared = set(SPLITS).intersection(*(splits for seeds in played for splits in seeds))
+        split = "stochastic" if "stochastic" in shared else "training"
+        if split not in shared:
+            continue
+        means = [pd.DataFrame([splits[split].mean() for splits in seeds]) for seeds in played]
+        row = {
+            "suite": suite,
+            "label": " − ".join(seeds["label"].iloc[0] for seeds in pair),
+            "split": split,
+            "seeds": ", ".join(str(len(seeds)) for seeds in means),
+            "steps": ", ".join({f"{seeds['steps'].iloc[0]:,}": None for seeds in pair}),
+        }
+        for name, column in (("return", "J_r"), ("cost", "M_c")):
+            one, other = (seeds[column] for seeds in means)
+            with warnings.catch_warnings(action="ignore"):  # of what has no interval
+                low, high = ttest_ind(one, other, equal_var=False).confidence_interval(0.95)
+            row |= {name: one.mean() - other.mean(), f"{name}_low": low, f"{name}_high": high}
+        rows.append(row)
+    return pd.DataFrame(rows)
 
 
 # Scores

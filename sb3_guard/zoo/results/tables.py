@@ -18,7 +18,7 @@ from sb3_guard.judging import physics_errors
 from sb3_guard.zoo.cli.markdown import escaped, table
 from sb3_guard.zoo.cli.usage import explained
 from sb3_guard.zoo.results.figure_data import Data
-from sb3_guard.zoo.results.statistics import SCORES, SPLITS
+from sb3_guard.zoo.results.statistics import SCORES, SPLITS, differences
 
 # A column's name, or a function of a row; by heading
 Cell = str | Callable[[Any], str]
@@ -35,6 +35,8 @@ CAPTIONS = {
     "Verdicts": f"{SPREAD} Brackets are the 95 % bootstrap interval of the mean. A limit is "
     "kept if the interval lies at or below it, exceeded if above it, else undecided. Excess "
     "is relative, a mean over the episodes above the limit.",
+    "Difference": "One algorithm's mean over seeds less the other's. Brackets are Welch's 95 % "
+    "interval; a difference whose interval contains 0 may be chance.",
     "Relative to TRPO": "Return, cost and cost rate of the final epoch relative to TRPO's. Those "
     "of families are means over algorithms, those of all environments means over environments.",
 }
@@ -154,6 +156,24 @@ VERDICT_HEADINGS: Columns = {
 }
 
 
+def _apart(name: str) -> Callable[[Any], str]:
+    """A cell with a difference and its interval."""
+    return lambda row: (
+        f"{number(row[name])} [{number(row[f'{name}_low'])}, {number(row[f'{name}_high'])}]"
+    )
+
+
+DIFFERENCES: Columns = {
+    "environment": "suite",
+    "difference": "label",
+    "episodes": lambda row: SPLITS[row["split"]],
+    "seeds": "seeds",
+    "steps": "steps",
+    "return": _apart("return"),
+    "cost": _apart("cost"),
+}
+
+
 def tables(data: Data) -> dict[str, pd.DataFrame]:
     """The tables of a report as text, by title."""
     who: Columns = {"environment": "suite", "algorithm": "label"}
@@ -178,6 +198,8 @@ def tables(data: Data) -> dict[str, pd.DataFrame]:
         ),
         "Verdicts": spelled(splits, {**who, **verdicts}),
     }
+    apart = differences(data.runs)
+    result["Difference"] = spelled(apart, DIFFERENCES) if len(apart) else apart
     scores = data.scores.reset_index()
     if scores[["reward", "cost"]].notna().any(axis=None):
         result["Relative to TRPO"] = spelled(scores, who | shown)

@@ -21,8 +21,8 @@ class TrainingFlags(Command):
     :param n_timesteps: number of training steps, e.g. 1e6 (default: n_timesteps of the
         hyperparameter file, else 1e6)
     :param hyperparams: hyperparameters that replace the defaults, e.g. n_steps:500 cost_limit:25
-    :param conf_file: hyperparameters: 'paper' for the GUARD paper's table, a YAML file, or a Python
-        file or module with a dictionary 'hyperparams' (default: hyperparams/<algo>.yml)
+    :param conf_file: hyperparameters: 'paper' for the GUARD paper's table, an algorithm, a YAML
+        file, or a Python file or module with 'hyperparams' (default: those of --algo or its base)
     :param env_kwargs: arguments of the environment, e.g. "hazards:{'num': 4}"
     :param vec_env: how environments are stepped: native (one batch), dummy (one after another),
         subproc (one process each) or gymnasium (the vector environment registered for the id, else

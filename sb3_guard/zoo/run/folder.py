@@ -148,19 +148,20 @@ class RunFolder:
         name = f"{flags.algo}{self.path.name[len(self.name) :]}"
         return Path(flags.tensorboard_log) / self.name / name
 
-    def again(self, flags: RunFlags) -> str:
+    def again(self) -> str:
         """The command that continues the run, for messages."""
         named = {"tensorboard_log", "track"}  # the command line names them again
-        words = map(shlex.quote, flags.words(named))
-        return " ".join([self._command("train -i", flags), *words])
+        flags = {name: value for name, value in self.args().items() if name in named and value}
+        words = map(shlex.quote, RunFlags.of(flags).words(named))
+        return " ".join([self._command("train -i"), *words])
 
-    def play(self, flags: RunFlags) -> str:
+    def play(self) -> str:
         """The command that plays the agent, for messages."""
-        return self._command("enjoy -f", flags)
+        return self._command("enjoy -f")
 
-    def _command(self, words: str, flags: RunFlags) -> str:
-        path = shlex.quote(str(self.path))
-        return f"sb3-guard {words} {path}{packages_flag(flags.gym_packages)}"
+    def _command(self, words: str) -> str:
+        path, packages = shlex.quote(str(self.path)), self.args().get("gym_packages") or ()
+        return f"sb3-guard {words} {path}{packages_flag(packages)}"
 
     def curve_hash(self) -> str:
         """SHA-256 of step, return and cost of all training episodes: runs alike have the same."""
@@ -184,8 +185,8 @@ class RunFolder:
         :raises UsageError: the run is not finished, or the file is damaged
         """
         if not self.result.exists():
-            raise UsageError(f"unfinished: sb3-guard train -i {self.path} continues it")
-        fix = f"sb3-guard train -i {self.path} writes it again"
+            raise UsageError(f"unfinished: {self.again()} continues it")
+        fix = f"{self.again()} writes it again"
         with explained("result.json is damaged", fix=fix):
             result: dict[str, Any] = json.loads(self.result.read_bytes())
             _ = result["costs"]  # every result has them

@@ -27,6 +27,7 @@ from stable_baselines3.common.noise import (
 )
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_guard.algorithms import ALGORITHMS, TrustRegion
 from sb3_guard.algorithms.common.arguments import signature
 from sb3_guard.fields import fit, is_data
 from sb3_guard.spelling import did_you_mean
@@ -37,6 +38,7 @@ from sb3_guard.zoo.cli.names import (
     with_classes,
 )
 from sb3_guard.zoo.cli.usage import UsageError, explained, read_mapping
+from sb3_guard.zoo.run.algos import algorithm, baselines
 
 # What a hyperparameter file may hold besides the algorithm's own arguments, as in RL-Zoo;
 # `selection_limit` is ours (see CostEvalCallback).
@@ -84,7 +86,7 @@ def read_file(path: str | Path) -> dict[str, Any]:
     if name.endswith((".yml", ".yaml")):
         content = read_mapping(name, "hyperparameter file", form)
     else:
-        fix = "give a .yml file, a Python file or module, or 'paper'"
+        fix = "give a .yml file, a Python file or module, a name such as ppo_lag, or paper"
         with explained(f"can't read hyperparameters from {name}", fix=fix):
             if name.endswith(".py"):
                 module = _ran(Path(name).resolve(), Path(name).stat().st_mtime_ns)
@@ -115,37 +117,61 @@ def shipped_file(algo: str) -> Path:
     return theirs if theirs.is_file() else ours
 
 
+def nearest(algo: str, conf_file: str | None = None) -> str:
+    """The algorithm whose shipped file is read: this one, else its nearest base that has one."""
+    if conf_file not in (None, PAPER) or shipped_file(algo).is_file():
+        return algo
+    table = {**baselines(), **ALGORITHMS, "trpo": TrustRegion}  # TRPO adds nothing to it
+    ours = {path.stem for path in hyperparams_folder().glob("*.yml")}
+    bases = {cls: key for key, cls in table.items() if key in ours}
+    return next((bases[cls] for cls in algorithm(algo).__mro__ if cls in bases), algo)
+
+
+def usual_limit(env_id: str) -> float | None:
+    """The cost limit of an episode in the shipped files; None: they have none."""
+    return (entry(read_file(shipped_file("cpo")), env_id) or {}).get("cost_limit")
+
+
 def read_hyperparams(
     algo: str, env_id: str, conf_file: str | None = None, overrides: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """
     The hyperparameters of an algorithm on an environment, not yet checked.
 
-    :param algo: key of the algorithm, names the shipped file
+    :param algo: key of the algorithm, names the shipped file; one without a file takes that of its
+        nearest base, where its class states no other default
     :param env_id: its own entry is taken, with or without a version, else the longest pattern
         that fits, else ``default``
-    :param conf_file: file to read instead of the shipped one; ``paper``: the shipped one, with what
-        is different in the paper's table
+    :param conf_file: file to read instead of the shipped one, or the algorithm whose shipped one;
+        ``paper``: the shipped one, with what is different in the paper's table
     :param overrides: what the command line says
     :raises UsageError: the file can't be read, or has no entry that fits
     """
     changes: dict[str, Any] = {}
+    base = nearest(algo, conf_file)
     if conf_file == PAPER:
         content = read_file(hyperparams_folder() / "paper.yml")
         changes = entry(content.pop("all"), env_id) or {}
-        if algo not in content:
+        if base not in content:
             raise UsageError(f"-conf {PAPER} has no {algo!r}; {did_you_mean(algo, content)}")
-        changes |= content[algo]
+        changes |= content[base]
         conf_file = None
-    path = conf_file or shipped_file(algo)
-    # An algorithm of a user has no shipped file; its own defaults serve.
+    named = conf_file or base  # an algorithm, or a file
+    path = shipped if (shipped := shipped_file(named)).is_file() else conf_file or shipped
+    # An algorithm of a user may have no base of ours; its own defaults serve.
     absent = conf_file is None and not Path(path).is_file()
     content = {"default": {}} if absent else read_file(path)
     values = entry(content, env_id)
     if values is None:
         hint = did_you_mean(env_id, content)
         raise UsageError(f"{path} has no entry for {env_id!r} and no 'default'; {hint}")
-    return {**values, **changes, **(overrides or {})}
+    values = {**values, **changes}
+    if base != algo:  # without those of which the class states another default
+        mine, theirs = (parameters(algorithm(key)) for key in (algo, base))
+        for name in values.keys() & theirs.keys():
+            if name not in mine or mine[name].default != theirs[name].default:
+                del values[name]
+    return {**values, **(overrides or {})}
 
 
 def entry(content: Mapping[str, dict[str, Any]], env_id: str) -> dict[str, Any] | None:

@@ -54,8 +54,8 @@ def make_model(
     :param algo: what ``--algo`` takes: an algorithm of this package, or one of RL-Zoo as a baseline
     :param env_id: an environment, whose version may be left out; a scenario, its plain data or its
         YAML file; or a class or function that makes one
-    :param conf: hyperparameters: ``"paper"`` or a file; None for the defaults in
-        ``hyperparams/<algo>.yml``
+    :param conf: hyperparameters: ``"paper"``, an algorithm or a file; None for the defaults in
+        ``hyperparams/<algo>.yml``, or in that of the nearest base which has one
     :param seed: of networks and environments; None for a random one
     :param env_kwargs: parameters of the environment, such as ``{"hazards": {"num": 4}}``
     :param vec_env: ``"native"``, ``"dummy"``, ``"subproc"`` or ``"gymnasium"``; None chooses
@@ -87,7 +87,7 @@ def make_model(
                 "device": device,
                 "num_threads": num_threads,
                 "eval_freq": -1,
-                "verbose": 0,
+                "verbose": int(verbose > 0),
             },
             "make_model",
         )

@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, suppress
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from multiprocessing.util import register_after_fork
 from pathlib import Path
 from types import SimpleNamespace
@@ -41,7 +41,12 @@ from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.algorithms.common.costs import limits_at, time_limit
 from sb3_guard.common.callbacks import CostEvalCallback, LogCosts
 from sb3_guard.common.delivery import FINAL_EPISODES, DeliveryCallback, play_final
-from sb3_guard.common.evaluation import Evaluation, check_normalizer, sync_normalization
+from sb3_guard.common.evaluation import (
+    Evaluation,
+    check_normalizer,
+    evaluate_policy,
+    sync_normalization,
+)
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
 from sb3_guard.common.sources import Source
@@ -76,8 +81,10 @@ from sb3_guard.zoo.run.hyperparams import (
     check,
     merged,
     model_arguments,
+    nearest,
     normalization,
     read_hyperparams,
+    usual_limit,
 )
 from sb3_guard.zoo.run.logger import RunLogger, cut
 from sb3_guard.zoo.run.make_envs import (
@@ -91,6 +98,7 @@ from sb3_guard.zoo.run.make_envs import (
 from sb3_guard.zoo.run.progress import Epochs, summary
 
 CERTIFICATE_ENVS = 100  # in which the last policy is played, and certificates are
+say_once = cache(print)  # a line that is the same for many runs of a grid
 WANDB = "wandb.txt"  # beside the run's configuration: its id at Weights & Biases
 
 
@@ -195,12 +203,21 @@ class Run:
             flags.seed = int(np.random.default_rng().integers(2**31))
         values = read_hyperparams(flags.algo, flags.env, flags.conf_file, flags.overrides())
         values = run.hyperparams = check(flags.algo, algo, values)
+        base = nearest(flags.algo, flags.conf_file)
+        if flags.verbose and base != flags.algo:
+            say_once(f"hyperparameters of {flags.algo}: those of {base}")
         if run.constrained and "cost_limit" not in values:
-            raise UsageError(
-                f"no cost limit is known for {flags.env}: give cost_limit, the highest cost of an "
-                "episode that you accept, such as half of what an episode costs PPO "
-                "(-params cost_limit:25)"
-            )
+            other = "cost_keys" in values or getattr(algo, "limit_on", "sum") == "max"
+            limit = None if other else usual_limit(flags.env)
+            if limit is None:
+                raise UsageError(
+                    f"no cost limit is known for {flags.env}: give cost_limit, the highest cost of "
+                    "an episode that you accept, such as half of what an episode costs PPO "
+                    "(-params cost_limit:25)"
+                )
+            values["cost_limit"] = limit
+            if flags.verbose:
+                say_once(f"cost_limit of {flags.algo} on {flags.env}: {limit:g}, the usual one")
         if flags.env_kwargs:
             values["env_kwargs"] = merged(values.get("env_kwargs") or {}, flags.env_kwargs)
         # What wraps single environments needs single ones.
@@ -661,9 +678,9 @@ class Run:
             print(f"  last epoch         {summary(result)}\n  run folder         {folder.path}")
             if finished:
                 self._beside_standing()
-                print(f"  see the agent      {folder.play(flags)}")
+                print(f"  see the agent      {folder.play()}")
             else:
-                print(f"  continue with      {folder.again(flags)}")
+                print(f"  continue with      {folder.again()}")
         return 0 if finished else 128 + (received or [signal.SIGTERM])[0]
 
     def _advise(self) -> None:
@@ -744,7 +761,7 @@ class Run:
                 return False
             raise UsageError(
                 f"a process of --vec-env {self.flags.vec_env} has died, by an error told above, a "
-                f"signal or for lack of memory; continue with: {folder.again(self.flags)}"
+                f"signal or for lack of memory; continue with: {folder.again()}"
             ) from error
         return True
 

@@ -38,10 +38,11 @@ from sb3_guard.zoo.tuning.trials import Objective, Settings, Stopped
 SETTINGS = "settings"
 
 
-def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
+def prepare(flags: TuneFlags, main: bool = True) -> tuple[RunFlags, Settings, Search]:
     """
     Check everything before anything is written.
 
+    :param main: see :func:`tune`
     :return: the flags of a training, and what the study is
     :raises UsageError: something is wrong with the flags
     """
@@ -49,8 +50,9 @@ def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
     if limit := flags.cost_limit:
         # Beside the trials: training with the result keeps the best model by the same limit.
         hyperparams["selection_limit"] = limit[0] if len(limit) == 1 else limit
-    how = {"hyperparams": hyperparams, "seed": flags.seeds[0], "verbose": 0, "progress": False}
-    run = Run.check(RunFlags.shared(flags, certify=0, **how))
+    how = {"hyperparams": hyperparams, "seed": flags.seeds[0], "progress": False}
+    run = Run.check(RunFlags.shared(flags, certify=0, verbose=flags.verbose * main, **how))
+    run.flags.verbose = 0  # of the trials
     values, n_timesteps = run.hyperparams, run.hyperparams["n_timesteps"]
     space = read_space(flags.search_space) if flags.search_space else None
     search = Search(flags.algo, values, space, fixed)
@@ -137,7 +139,7 @@ def tune(flags: TuneFlags, main: bool = True) -> int:
 
 
 def _tune(flags: TuneFlags, main: bool) -> int:
-    training, settings, search = prepare(flags)
+    training, settings, search = prepare(flags, main)
     suffix = f"_{folder_name(flags.study_name)}" if flags.study_name else ""
     folder = Path(flags.log_folder) / settings.algo / f"{folder_name(settings.env)}_tune{suffix}"
     name = flags.study_name or f"{settings.algo}_{settings.env}"

@@ -31,7 +31,7 @@ if None in output["stop"]:
 stop = np.array([np.nan if value == "hold" else value for value in output["stop"]], np.float32)
 (latest, _), rng = robot.reset(seed=0), np.random.default_rng(0)
 frames = np.resize(latest, inputs["observation"])  # of a stack: the first one, repeated
-observation, missing, stops, cost, costs, sent = latest, 0, 0, 0.0, [], None
+observation, missing, stops, cost, costs, sent, episodes = latest, 0, 0, 0.0, [], None, 1
 for _ in range(500):
     began, lost = time.perf_counter(), sent is not None and rng.random() < 0.05  # 1 in 20 is lost
     missing, observation = (missing + 1, observation) if lost else (0, latest)
@@ -47,11 +47,11 @@ for _ in range(500):
     costs.append([info[bound["name"]] for bound in bounds])
     cost = sum(costs[-1])
     if terminated or truncated:
-        (latest, _), cost = robot.reset(), 0.0
+        (latest, _), cost, episodes = robot.reset(), 0.0, episodes + 1
         frames = np.resize(latest, inputs["observation"])
     time.sleep(max(0.0, began + period - time.perf_counter()))
 np.savetxt("costs.csv", costs)
-for bound, each in zip(bounds, np.transpose(costs), strict=True):
-    total = max(each) if bound["per"] == "step" else sum(each)
-    print(f"{bound['name']} {total:.2f} in 500 steps, limit {bound['limit']} per {bound['per']}")
-print(f"stopped {stops} times")
+for bound, steps in zip(bounds, np.transpose(costs), strict=True):
+    total = max(steps) if bound["per"] == "step" else sum(steps)
+    print(f"{bound['name']} {total:.2f}, limit {bound['limit']} per {bound['per']}")
+print(f"{len(costs)} steps of {episodes} episodes, stopped {stops} times")

@@ -131,13 +131,10 @@ def state_of_off_policy(model: Any) -> list[Any]:
 
 
 @pytest.mark.filterwarnings("ignore:rich is experimental")
-def test_the_progress_bar_shows_the_mean_cost_of_an_episode(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    shown = []
-    monkeypatch.setattr(
-        "tqdm.rich.tqdm.set_description", lambda bar, text, refresh: shown.append(text)
-    )
+def test_the_progress_bar_shows_the_mean_cost(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[str] = []
+    write = "tqdm.rich.tqdm.set_description"
+    monkeypatch.setattr(write, lambda bar, text, refresh: shown.append(text))
     model = CPO("MlpPolicy", points(), n_steps=60, cost_limit=1.0)
     model.learn(240, progress_bar=True)
     assert shown == [f"cost {np.mean(model.costs.latest):.2f}"] != ["cost 0.00"]

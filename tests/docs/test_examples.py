@@ -26,10 +26,7 @@ SAYS = {
     "custom_algorithm": (["cost of an episode: ["], []),
     "custom_constraint": (["steps outside: ["], []),
     "custom_robot": (["26 observations, 2 actions", "return "], ["puck.xml"]),
-    "deploy": (
-        [", limit 5.0 per episode", "stopped "],
-        ["contract.json", "costs.csv", "policy.onnx"],
-    ),
+    "deploy": ([", limit 5.0 per episode"], ["contract.json", "costs.csv", "policy.onnx"]),
     "several_constraints": (["return", "cost_hazards, limit 5.0", "cost_ghosts, limit 2.0"], []),
     "train_cpo": (["ep_cost_mean", ", limit 5; "], ["cpo_point.zip"]),
     "tune_with_optuna": (["0 ", "1 ", "limit"], []),
@@ -118,13 +115,16 @@ DEPLOY = (EXAMPLES / "deploy.py").read_text()
 CONTRACT = {
     "control_step": 10.0,
     "wrappers": [],
-    "costs": [{"name": "cost", "limit": 2.0, "per": "episode"}],
+    "costs": [
+        {"name": "cost_speed", "limit": 2.0, "per": "episode"},
+        {"name": "cost_hazards", "limit": 0.5, "per": "step"},
+    ],
     "frame_stack": {"frames": 3},
-    "trained": {
-        "env": "Goal_Point_8Hazards-v0",
-        "env_kwargs": {"hazards": None, "speed": {"limit": 0.01}},
-    },
+    "trained": {"env": "Mine-v0", "env_kwargs": {"speed": {"limit": 0.01}}},
 }
+MINE = """import sb3_guard
+sb3_guard.register("Mine-v0", "Goal_Point_8Hazards")
+"""
 
 
 class Recorded:
@@ -138,8 +138,10 @@ class Recorded:
         return [np.ones((1, 2), np.float32)]
 
 
-def test_the_loop_around_a_policy_stacks_frames_and_knows_the_last_cost(quick, monkeypatch):
-    env = gymnasium.make("Goal_Point_8Hazards-v0", hazards=None, speed={"limit": 0.01})
+def test_the_loop_around_a_policy_stacks_frames_and_knows_the_costs(quick, monkeypatch, capsys):
+    (quick / "my_robots.py").write_text(MINE)
+    monkeypatch.setattr(sys, "argv", ["deploy.py", "my_robots"])
+    env = gymnasium.make("Goal_Point_8Hazards-v0", speed={"limit": 0.01})
     observation, _ = env.reset(seed=0)
     size = len(observation)
     shapes = {"observation": 3 * size, "last_cost": 1}
@@ -163,7 +165,12 @@ def test_the_loop_around_a_policy_stacks_frames_and_knows_the_last_cost(quick, m
         if truncated:
             (observation, _), cost = env.reset(), 0.0
             frames = np.tile(observation, 3)
-    assert step == 11 and any(names["costs"])
+    assert step == 11 and (costs := np.array(names["costs"]))[:, 0].any()
+    assert capsys.readouterr().out.splitlines() == [
+        f"cost_speed {costs[:, 0].sum():.2f}, limit 2.0 per episode",
+        f"cost_hazards {costs[:, 1].max():.2f}, limit 0.5 per step",
+        "12 steps of 2 episodes, stopped 0 times",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -175,7 +182,8 @@ def test_the_loop_around_a_policy_stacks_frames_and_knows_the_last_cost(quick, m
 )
 def test_it_says_what_it_does_not_compute(change, words, quick, monkeypatch):
     inputs = [{"name": "observation", "shape": ["batch", 3]}]
-    contract = {**CONTRACT, "inputs": inputs, "outputs": [{}], **change}
+    env = {"trained": {"env": "Goal_Point_8Hazards-v0"}}
+    contract = {**CONTRACT, "inputs": inputs, "outputs": [{}], **env, **change}
     (quick / "contract.json").write_text(json.dumps(contract))
     monkeypatch.setattr(onnxruntime, "InferenceSession", Recorded)
     with pytest.raises(SystemExit, match=words):
@@ -188,38 +196,8 @@ def test_it_says_what_it_does_not_compute(change, words, quick, monkeypatch):
 )
 def test_it_says_what_is_absent(argv, words, quick, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["deploy.py", *argv])
-    with pytest.raises(
-        SystemExit, match=f"{words}: start it beside policy.onnx; python deploy.py M"
-    ):
+    with pytest.raises(SystemExit, match=f"{words}: start it beside policy.onnx; python deploy"):
         exec(compile(DEPLOY, "deploy.py", "exec"), {})
-
-
-def test_it_runs_a_robot_of_a_module_and_prints_each_cost_beside_its_limit(
-    quick, monkeypatch, capsys
-):
-    (quick / "my_robots.py").write_text(
-        "import sb3_guard\nworld = {'hazards': {'num': 8}, 'speed': {'limit': 0.0}}\n"
-        "sb3_guard.register('Mine-v0', sb3_guard.Scenario(constraints=world))\n"
-    )
-    monkeypatch.setattr(sys, "argv", ["deploy.py", "my_robots"])
-    env = sb3_guard.make("Goal_Point_8Hazards", speed={"limit": 0.0})
-    inputs = [{"name": "observation", "shape": ["batch", *env.observation_space.shape]}]
-    outputs = [{"name": "action", "low": [-1.0] * 2, "high": [1.0] * 2, "stop": [0.0, 0.0]}]
-    costs = [
-        {"name": "cost_hazards", "limit": 2.0, "per": "episode"},
-        {"name": "cost_speed", "limit": 0.5, "per": "step"},
-    ]
-    contract = {**CONTRACT, "trained": {"env": "Mine-v0"}, "costs": costs}
-    (quick / "contract.json").write_text(
-        json.dumps({**contract, "inputs": inputs, "outputs": outputs})
-    )
-    monkeypatch.setattr(onnxruntime, "InferenceSession", Recorded)
-    monkeypatch.setattr("time.sleep", lambda seconds: None)
-    exec(compile(shorten(DEPLOY), "deploy.py", "exec"), {})
-    hazards, speed, stopped = capsys.readouterr().out.splitlines()
-    assert re.fullmatch(r"cost_hazards \d+\.\d\d in 500 steps, limit 2.0 per episode", hazards)
-    assert speed == "cost_speed 1.00 in 500 steps, limit 0.5 per step"
-    assert stopped == "stopped 0 times"
 
 
 NOTEBOOK = EXAMPLES / "quickstart.ipynb"

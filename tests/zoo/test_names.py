@@ -101,13 +101,8 @@ def test_a_runs_files_run_nothing(tmp_path, trap, run, capsys):
     enter(run, "config.yml", env_wrapper=None)
     enter(run, "args.yml", gym_packages=["hostile"])
     without = [word for word in play if word not in TOY[:2]]
-    refused(
-        enjoy.main,
-        without,
-        capsys,
-        f"{run} needs gym_packages",
-        "look at hostile, then add --gym-packages hostile",
-    )
+    said = "look at hostile, then add --gym-packages hostile"
+    refused(enjoy.main, without, capsys, f"{run} needs gym_packages", said)
     refused(train.main, [*go_on[:2], "-n", "240"], capsys, "then add --gym-packages hostile")
     assert not trap.exists()
     enjoy.main([*without, "--gym-packages", "hostile"])

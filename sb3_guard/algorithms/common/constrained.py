@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
@@ -24,7 +24,7 @@ from sb3_guard.algorithms.common.arguments import (
     signature,
     stated,
 )
-from sb3_guard.algorithms.common.costs import Costs, scheduled_limits, time_limit
+from sb3_guard.algorithms.common.costs import CostBar, Costs, scheduled_limits, time_limit
 from sb3_guard.checks import check_cost_keys
 from sb3_guard.costs import read_costs
 from sb3_guard.judging import Limits
@@ -34,15 +34,6 @@ BROKEN_OFF = (
     "eval_env is the training environment, whose episodes every evaluation would break off: make "
     "another one for it"
 )
-
-
-class CostBar(ProgressBarCallback):
-    """SB3's progress bar, with the mean costs of the latest episodes."""
-
-    def _on_rollout_end(self) -> None:
-        if latest := self.model.costs.latest:  # type: ignore[attr-defined]
-            means = map("{:.2f}".format, np.mean(latest, axis=0))
-            self.pbar.set_description(f"cost {', '.join(means)}", refresh=False)
 
 
 class Constrained(BaseAlgorithm):

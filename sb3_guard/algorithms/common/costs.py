@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
+from stable_baselines3.common.callbacks import ProgressBarCallback
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_guard.checks import check_per_cost
@@ -64,6 +65,15 @@ def time_limit(env: Any) -> float | None:
     """The mean over environments of the steps of an episode at most; None where not stated."""
     limits = step_limits(env)
     return float(np.mean(limits)) if limits else None
+
+
+class CostBar(ProgressBarCallback):
+    """SB3's progress bar, with the mean costs of the latest episodes."""
+
+    def _on_rollout_end(self) -> None:
+        if latest := self.model.costs.latest:  # type: ignore[attr-defined]
+            means = map("{:.2f}".format, np.mean(latest, axis=0))
+            self.pbar.set_description(f"cost {', '.join(means)}", refresh=False)
 
 
 class Costs:

@@ -61,8 +61,7 @@ def costs(env: GuardVectorEnv, env_id: str) -> Iterator[str]:
     how = "1 if any of these costs" if env.scenario.cost == "any" else "their sum"
     if len(parts) > 1:
         yield f"info['cost']: {how}."
-    limit = usual_limit(env_id)
-    if limit is not None and parts:
+    if parts and (limit := usual_limit(env_id)) is not None:
         yield f"Usual cost limit of an episode: {limit:g}."
     steps = env.max_episode_steps
     yield f"An episode has {steps} steps of {env.engine.control_step:g} s."

@@ -164,14 +164,9 @@ def _apart(name: str) -> Callable[[Any], str]:
 
 
 DIFFERENCES: Columns = {
-    "environment": "suite",
-    "difference": "label",
-    "episodes": lambda row: SPLITS[row["split"]],
-    "seeds": "seeds",
-    "steps": "steps",
-    "return": _apart("return"),
-    "cost": _apart("cost"),
-}
+    "environment": "suite", "difference": "label", "episodes": lambda row: SPLITS[row["split"]],
+    "seeds": "seeds", "steps": "steps", "return": _apart("return"), "cost": _apart("cost"),
+}  # fmt: skip
 
 
 def tables(data: Data) -> dict[str, pd.DataFrame]:
@@ -198,8 +193,7 @@ def tables(data: Data) -> dict[str, pd.DataFrame]:
         ),
         "Verdicts": spelled(splits, {**who, **verdicts}),
     }
-    apart = differences(data.runs)
-    result["Difference"] = spelled(apart, DIFFERENCES) if len(apart) else apart
+    result["Difference"] = spelled(differences(data.runs), DIFFERENCES)
     scores = data.scores.reset_index()
     if scores[["reward", "cost"]].notna().any(axis=None):
         result["Relative to TRPO"] = spelled(scores, who | shown)

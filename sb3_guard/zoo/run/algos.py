@@ -24,5 +24,6 @@ def algorithm(key: str) -> type[BaseAlgorithm]:
     # RL-Zoo, which takes a while to import, is asked only where it must be.
     table = ALGORITHMS if key in ALGORITHMS else {**ALGORITHMS, **baselines()}
     if key not in table:
-        raise UsageError(f"unknown algorithm {key!r}; {did_you_mean(key, table)}")
+        hint = f"{did_you_mean(key, table)}, or of a module that --gym-packages names"
+        raise UsageError(f"unknown algorithm {key!r}; {hint}")
     return table[key]

@@ -18,10 +18,9 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.algorithms.common.constrained import Constrained
-from sb3_guard.checks import check_cost_keys, check_per_cost
 from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.common.monitor import cost_keys_of
-from sb3_guard.costs import bounded_name
+from sb3_guard.costs import bounded_name, check_cost_keys, check_per_cost
 from sb3_guard.fields import fit
 from sb3_guard.vector import as_vec_env, lacks_statistics, moments_of, own_statistics
 

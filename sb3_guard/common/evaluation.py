@@ -18,7 +18,6 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
 from sb3_guard.algorithms.common.constrained import BROKEN_OFF, Constrained
-from sb3_guard.checks import NumberError, check_cost_keys
 from sb3_guard.common.monitor import cost_keys_of, total_cost
 from sb3_guard.costs import (
     EpisodeCost,
@@ -26,9 +25,11 @@ from sb3_guard.costs import (
     Estimate,
     beside,
     bounded_name,
+    check_cost_keys,
     estimate,
     read_costs,
 )
+from sb3_guard.errors import NumberError
 from sb3_guard.vector import (
     as_vec_env,
     lacks_statistics,

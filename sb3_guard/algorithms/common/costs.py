@@ -8,8 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_guard.checks import check_per_cost
-from sb3_guard.costs import EpisodeCosts
+from sb3_guard.costs import EpisodeCosts, check_per_cost
 from sb3_guard.vector import step_limits
 
 # A certificate's last look: its episodes, and the quantile of its error, which three agents share.

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from sb3_guard.spelling import did_you_mean
+from sb3_guard.fields import did_you_mean
 from sb3_guard.zoo.cli.flags import command, flag
 from sb3_guard.zoo.cli.usage import UsageError, import_packages, read_mapping
 from sb3_guard.zoo.run.flags import EvaluationFlags, RunFlags, TrainingFlags

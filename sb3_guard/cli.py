@@ -4,7 +4,7 @@ import importlib
 import sys
 from collections.abc import Sequence
 
-from sb3_guard.spelling import did_you_mean
+from sb3_guard.fields import did_you_mean
 
 COMMANDS = {
     "train": "train an agent",

@@ -7,8 +7,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from sb3_guard.checks import ContractError, NumberError
-from sb3_guard.spelling import nearest
+from sb3_guard.errors import ContractError, NumberError
+from sb3_guard.fields import nearest
 
 
 def number(value: Any, name: str) -> float:
@@ -155,3 +155,36 @@ class EpisodeCosts:
         length = int(self.lengths[row])
         self.totals[row] = self.highest[row] = self.lengths[row] = 0
         return EpisodeCost(row, total, highest, bounded, length)
+
+
+def check_cost_keys(keys: Any) -> tuple[str, ...]:
+    """
+    :return: the keys
+    :raises ValueError: ``keys`` is not a sequence of different names
+    """
+    if (
+        isinstance(keys, str)
+        or len(keys) < 1
+        or not all(isinstance(key, str) for key in keys)
+        or len(set(keys)) < len(keys)
+    ):
+        raise ValueError(
+            f"cost_keys={keys!r}: must be a sequence of one or more different names of info "
+            "entries, such as ('cost',)"
+        )
+    return tuple(keys)
+
+
+def check_per_cost(name: str, value: Any, cost_keys: tuple[str, ...]) -> None:
+    """
+    :raises ValueError: ``value`` is not one finite number, or one for each cost key
+    """
+    numbers = np.asarray(value)
+    if numbers.ndim > 1 or (numbers.ndim == 1 and len(numbers) != len(cost_keys)):
+        raise ValueError(
+            f"{name}={value!r}: must be one number, or one for each of the "
+            f"{len(cost_keys)} cost keys {cost_keys}"
+        )
+    if numbers.dtype.kind not in "iuf" or not np.all(np.isfinite(numbers)):
+        order = f", in the order of cost_keys={cost_keys}" if len(cost_keys) > 1 else ""
+        raise ValueError(f"{name}={value!r}: must be finite numbers{order}")

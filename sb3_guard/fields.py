@@ -2,20 +2,22 @@
 
 Hyperparameters, parameters of environments and flags have one rule. Booleans are no numbers, and
 NaN is none; a whole float is an integer; text that is a number counts as one, since YAML reads 1e-3
-as text. Text of command lines and files is read from its syntax tree and never evaluated.
+as text. Text of command lines and files is read from its syntax tree and never evaluated; YAML is
+plain data. Every error message about a name ends with what a misspelled one may have meant.
 """
 
 import ast
+import difflib
+import fnmatch
 import math
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
 import numpy as np
-
-from sb3_guard.spelling import did_you_mean
+import yaml
 
 _WORDS: dict[Any, str] = {
     float: "a number",
@@ -231,3 +233,76 @@ def is_data(value: Any) -> bool:
     if isinstance(value, list | tuple):
         return all(map(is_data, value))
     return value is None or isinstance(value, str | bool | int | float)
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite number; booleans are not."""
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    return number and bool(np.isfinite(value))
+
+
+# Names
+
+
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """The allowed name that ``name`` most likely meant, whatever its case; None: nothing is near.
+
+    :param known: allowed names; among equally near ones the first is meant
+    """
+    wrong = str(name).lower()
+
+    def likeness(allowed: str) -> float:
+        return difflib.SequenceMatcher(None, allowed.lower(), wrong).ratio()
+
+    close = max(known, key=likeness, default="")
+    return close if likeness(close) >= 0.6 else None
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Say what ``name`` may have meant and what is allowed, for an error message.
+
+    :param known: allowed names; among equally near ones the first is meant
+    """
+    known = list(known)
+    close = nearest(name, known)
+    hint = "" if close is None else f"did you mean {close!r}? "
+    return f"{hint}allowed: {', '.join(known) or 'none'}"
+
+
+def matching(label: str, pattern: str, known: Iterable[str]) -> list[str]:
+    """The names that a pattern matches, such as ``*_knee`` (``*``: any text, ``?``: a character).
+
+    :param label: what an error message calls the place of the pattern
+    :param known: allowed names
+    :raises ValueError: there is none
+    """
+    known, pattern = list(known), str(pattern)
+    names = fnmatch.filter(known, pattern) or [name for name in known if name == pattern]
+    if not names:
+        raise ValueError(f"{label} matches no name {pattern!r}: {did_you_mean(pattern, known)}")
+    return names
+
+
+# YAML
+
+
+# In C where libyaml is there, ten times as fast: a large grid reads a thousand files.
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    pass
+
+
+def _ordered(loader: Any, node: Any) -> dict[Any, Any]:
+    """The ordered mapping that RL-Zoo writes: a list of one list of pairs."""
+    return dict(*loader.construct_sequence(node, deep=True))
+
+
+_Loader.add_constructor("tag:yaml.org,2002:python/object/apply:collections.OrderedDict", _ordered)
+
+
+def load_yaml(text: str) -> Any:
+    """
+    The plain data of a YAML text.
+
+    :raises yaml.YAMLError: it is no YAML
+    """
+    return yaml.load(text, _Loader)

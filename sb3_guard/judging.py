@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from scipy import stats
 
-from sb3_guard.checks import check_per_cost
+from sb3_guard.costs import check_per_cost
 
 #: Episodes of a certificate: an event of one in 200 of them is missed with a probability of 5 %.
 EPISODES = 600

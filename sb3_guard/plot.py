@@ -11,7 +11,7 @@ import jinja2
 import pandas as pd
 
 from sb3_guard import __version__
-from sb3_guard.spelling import did_you_mean
+from sb3_guard.fields import did_you_mean
 from sb3_guard.zoo.cli.flags import Command, command, flag
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.results import figures, tables

@@ -25,8 +25,8 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from sb3_guard.checks import ContractError, is_number
-from sb3_guard.fields import fit
+from sb3_guard.errors import ContractError
+from sb3_guard.fields import fit, is_number
 
 #: ``cost(obs, actions, next_obs, infos)``, of N rows at once
 BatchCost = Callable[[Any, Any, Any, Any], Any]

@@ -18,7 +18,7 @@ from gymnasium.error import DependencyNotInstalled
 from gymnasium.utils import RecordConstructorArgs
 
 from sb3_guard.costs import number
-from sb3_guard.spelling import nearest
+from sb3_guard.fields import nearest
 
 #: ``cost(obs, action, next_obs, info)``, see :class:`CostFromFunction`
 CostFunction = Callable[[Any, Any, Any, dict[str, Any]], Any]

@@ -15,9 +15,9 @@ import torch as th
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_guard.checks import check_cost_keys
 from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.common.monitor import cost_keys_of
+from sb3_guard.costs import check_cost_keys
 from sb3_guard.fields import fit
 from sb3_guard.judging import EPISODES, ERROR, LEAST, Bound, Judgement, Limits, decide
 from sb3_guard.vector import (

@@ -19,9 +19,9 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
 from sb3_guard.algorithms.common.constrained import BROKEN_OFF, Constrained
-from sb3_guard.checks import NumberError, check_cost_keys
 from sb3_guard.common.monitor import cost_keys_of, total_cost
-from sb3_guard.costs import EpisodeCost, EpisodeCosts, read_costs
+from sb3_guard.costs import EpisodeCost, EpisodeCosts, check_cost_keys, read_costs
+from sb3_guard.errors import NumberError
 from sb3_guard.judging import Limits, Mean
 from sb3_guard.vector import (
     as_vec_env,

@@ -13,8 +13,8 @@ from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, is_vecenv_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_guard.checks import NumberError, check_cost_keys
-from sb3_guard.costs import EpisodeCost, EpisodeCosts, number, read_costs
+from sb3_guard.costs import EpisodeCost, EpisodeCosts, check_cost_keys, number, read_costs
+from sb3_guard.errors import NumberError
 from sb3_guard.vector import layers, step_limits
 
 

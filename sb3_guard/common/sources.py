@@ -18,8 +18,8 @@ from gymnasium.error import DependencyNotInstalled
 
 from sb3_guard.common.adapters import is_safety_gymnasium, make_safety_gymnasium
 from sb3_guard.common.native import GuardVecEnv
+from sb3_guard.fields import nearest
 from sb3_guard.ids import ENTRY_POINT, IMPORT_FIRST, UnknownId, with_version
-from sb3_guard.spelling import nearest
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv

@@ -19,9 +19,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_guard.common.monitor import CostMonitor
 from sb3_guard.common.sources import Source, find
-from sb3_guard.fields import fit
+from sb3_guard.fields import did_you_mean, fit
 from sb3_guard.ids import UnknownPart
-from sb3_guard.spelling import did_you_mean
 from sb3_guard.vector import BatchVecEnv, as_vec_env
 
 if TYPE_CHECKING:

@@ -12,7 +12,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.algorithms.common.constrained import Constrained
-from sb3_guard.checks import is_number
 from sb3_guard.common.vec_budgets import Counted, VecMaxCost
 from sb3_guard.deployment.deployed import Deployed
 from sb3_guard.deployment.environment import (
@@ -24,7 +23,7 @@ from sb3_guard.deployment.environment import (
     ours_of,
 )
 from sb3_guard.deployment.observations import OBSERVATION, inputs_of
-from sb3_guard.spelling import did_you_mean
+from sb3_guard.fields import did_you_mean, is_number
 
 FORMAT = 4  # increased when the content changes
 HOLD = "hold"  # the last value is sent again

@@ -14,7 +14,6 @@ import numpy as np
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from numpy.typing import DTypeLike
 
-from sb3_guard.checks import NumberError
 from sb3_guard.envs.arena import Arena
 from sb3_guard.envs.drawn import Drawn
 from sb3_guard.envs.extras import Extras
@@ -28,8 +27,8 @@ from sb3_guard.envs.part import Constraint, Part, Robot, Task
 from sb3_guard.envs.physics import Physics
 from sb3_guard.envs.placing import Placing
 from sb3_guard.envs.types import Array
-from sb3_guard.fields import fit
-from sb3_guard.spelling import did_you_mean
+from sb3_guard.errors import NumberError
+from sb3_guard.fields import did_you_mean, fit
 
 CLEAN_STARTS = 100  # layouts drawn before a start with a cost is an error
 

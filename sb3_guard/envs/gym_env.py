@@ -18,8 +18,7 @@ from sb3_guard.envs.rendering import CAMERAS, Renderer
 from sb3_guard.envs.robots.robot import PREFIX
 from sb3_guard.envs.scenario import Scenario
 from sb3_guard.envs.types import Array
-from sb3_guard.fields import fit
-from sb3_guard.spelling import did_you_mean
+from sb3_guard.fields import did_you_mean, fit
 
 ROW = np.zeros(1, dtype=np.int32)
 

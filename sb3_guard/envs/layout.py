@@ -16,9 +16,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sb3_guard.checks import WorldError
 from sb3_guard.envs.parameters import Parameters, param
 from sb3_guard.envs.types import Array
+from sb3_guard.errors import WorldError
 
 Rectangle = tuple[float, float, float, float]
 StartOver = Callable[[Array, Array, Array, bool], Array | None]

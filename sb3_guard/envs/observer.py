@@ -11,7 +11,7 @@ from sb3_guard.envs.geometry import into_frames
 from sb3_guard.envs.observation import Channel, Compass, Lidar, Observations, Scan, Values, compass
 from sb3_guard.envs.part import Part, Robot
 from sb3_guard.envs.types import Array
-from sb3_guard.spelling import did_you_mean
+from sb3_guard.fields import did_you_mean
 
 
 class Observer:

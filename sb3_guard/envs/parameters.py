@@ -13,9 +13,8 @@ from collections.abc import Mapping
 from dataclasses import field
 from typing import Any, NamedTuple
 
-from sb3_guard.checks import WorldError
-from sb3_guard.fields import fit, in_words
-from sb3_guard.spelling import did_you_mean
+from sb3_guard.errors import WorldError
+from sb3_guard.fields import did_you_mean, fit, in_words
 
 
 class PartError(WorldError, ValueError):

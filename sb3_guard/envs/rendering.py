@@ -20,9 +20,9 @@ import mujoco
 import numpy as np
 from mujoco.rendering.classic import gl_context
 
-from sb3_guard.checks import WorldError
 from sb3_guard.envs.scene import COST_COLOR, ScenePainter, arena, frame_all, has_arena, robot_geoms
 from sb3_guard.envs.types import Array
+from sb3_guard.errors import WorldError
 
 if TYPE_CHECKING:
     from sb3_guard.envs.engine import Engine

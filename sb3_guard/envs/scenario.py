@@ -11,6 +11,8 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from sb3_guard.envs import suites
 from sb3_guard.envs.arena import Arena
 from sb3_guard.envs.constraints.obstacles import Obstacles
@@ -20,9 +22,8 @@ from sb3_guard.envs.layout import Layout
 from sb3_guard.envs.observation import Lidar
 from sb3_guard.envs.part import Robot
 from sb3_guard.envs.registry import CONSTRAINTS, KEYWORDS, OPTIONS, ROBOTS, TASKS
-from sb3_guard.fields import plain
+from sb3_guard.fields import did_you_mean, load_yaml, plain
 from sb3_guard.ids import UnknownPart
-from sb3_guard.spelling import did_you_mean
 
 Params = Mapping[str, Any]
 COSTS = ("sum", "any")
@@ -121,10 +122,6 @@ class Scenario:
         :raises ValueError: the file is missing, is not YAML in UTF-8, or holds unknown keys or one
             key twice
         """
-        import yaml
-
-        from sb3_guard.plain_yaml import load_yaml
-
         try:
             data = load_yaml(Path(path).read_text(encoding="utf-8"))
         except (OSError, ValueError, yaml.YAMLError) as error:

@@ -43,7 +43,7 @@ def test_without_a_price_it_is_sb3s_ppo_bit_for_bit() -> None:
     a = state_of(PPO("MlpPolicy", points(), **kwargs).learn(256))
     model = PPOLagrangian("MlpPolicy", points(), cost_limit=1e6, **kwargs).learn(256)
     assert a == state_of(model)
-    assert model.total_cost > 0.0 and float(model.multiplier.value) == 0.0
+    assert model.total_cost > 0.0 and float(model.multiplier.value[0]) == 0.0
     assert model.logger.name_to_value["train/cost_value_loss"] > 0.0
 
 
@@ -94,7 +94,7 @@ def test_with_a_price_it_keeps_a_positive_limit() -> None:
         "MlpPolicy", env, n_steps=64, batch_size=512, n_epochs=4, learning_rate=1e-2,
         cost_limit=0.5, lambda_lr=0.1, seed=0, device="cpu",
     ).learn(20_000)  # fmt: skip
-    assert float(model.multiplier.value) > 0.1
+    assert float(model.multiplier.value[0]) > 0.1
     action, _ = model.predict(np.ones((1, 1), np.float32), deterministic=True)
     np.testing.assert_allclose(action[0], LinearCostBandit().optimum(0.5), atol=0.15)
     assert np.mean(model.costs.latest) == pytest.approx(0.5, abs=0.1)

@@ -90,7 +90,7 @@ def test_while_the_limit_holds_it_is_sb3s_bit_for_bit(ours: Any, theirs: Any, mo
     state = state_of(expected)
     model = ours("MlpPolicy", VecNormalize(points()), cost_limit=1e6, **kwargs()).learn(200)
     assert state_of(model) == state
-    assert model.total_cost > 0.0 and float(model.multiplier.value) == 0.0
+    assert model.total_cost > 0.0 and float(model.multiplier.value[0]) == 0.0
     for name in ("actor_loss", "critic_loss", "n_updates", "learning_rate"):
         assert model.logger.name_to_value[f"train/{name}"] == pytest.approx(
             logged[f"train/{name}"], rel=1e-6
@@ -323,7 +323,7 @@ def test_multipliers_follow_ended_episodes_once_and_not_before_their_time(cls: A
     seen: dict[int, float] = {}
 
     def look(names: dict[str, Any], _: Any) -> bool:
-        seen[names["self"].num_timesteps] = float(model.multiplier.value)
+        seen[names["self"].num_timesteps] = float(model.multiplier.value[0])
         return True
 
     model.learn(180, callback=look)
@@ -354,7 +354,7 @@ def test_multipliers_follow_the_mean_of_episodes(cls: Any) -> None:
     for limit in (5.0, 7.0):
         env = given(itertools.cycle([0.0] * 9 + [60.0]), 1, length=3)
         model = cls("MlpPolicy", env, cost_limit=limit, **settings()).learn(300)
-        values.append(float(model.multiplier.integral))
+        values.append(float(model.multiplier.integral[0]))
     assert values[0] > 0.1 and values[1] == 0.0
 
 
@@ -368,7 +368,7 @@ def test_a_safety_margin_is_a_share_of_the_limit(cls: Any, sign: float) -> None:
     for margin in (0.0, 0.2, 0.4):
         env = given(itertools.repeat(5.0 * sign - 0.2), 1, length=4)
         model = cls("MlpPolicy", env, safety_margin=margin, **gains, **settings())
-        values.append(float(model.learn(200).multiplier.integral))
+        values.append(float(model.learn(200).multiplier.integral[0]))
     assert values[0] == 0.0 and values[2] / values[1] == pytest.approx(1.8 / 0.8)
 
 
@@ -381,7 +381,7 @@ def test_a_training_moves_multipliers_as_far_however_many_episodes_it_has(
     env = given(itertools.repeat(150.0), n_envs, length=4)
     more = {"cost_limit": 100.0, "lambda_lr": 2.0, "proportional_gain": 0.0, "lambda_starts": 0.4}
     model = cls("MlpPolicy", env, **more, **settings() | {"train_freq": 2}).learn(total)
-    assert float(model.multiplier.value) == pytest.approx(np.log(1.0 / 0.4), abs=0.1)
+    assert float(model.multiplier.value[0]) == pytest.approx(np.log(1.0 / 0.4), abs=0.1)
 
 
 def paid(size: float) -> Any:
@@ -434,7 +434,7 @@ def test_random_actions_do_not_move_multipliers(cls: Any) -> None:
     env = given([100.0] * 88 + [0.0] * 40, 8, length=1)
     more = {"cost_limit": 5.0, "gradient_steps": -1}
     model = cls("MlpPolicy", env, **more, **settings() | {"learning_starts": 81}).learn(96)
-    assert model._n_updates == 16 and float(model.multiplier.value) == 0.0
+    assert model._n_updates == 16 and float(model.multiplier.value[0]) == 0.0
     assert np.ravel(model.latest_costs).tolist() == [0.0] * 8
 
 
@@ -504,7 +504,7 @@ def test_saved_and_loaded(cls: Any, tmp_path: Path) -> None:
     again = cls.load(tmp_path / "model", env=points())
     again.load_replay_buffer(tmp_path / "buffer")
     assert again.buffer_size == 500 and again.replay_buffer.costs.any()
-    assert float(again.multiplier.value) == float(model.multiplier.value) > 0.0
+    assert float(again.multiplier.value[0]) == float(model.multiplier.value[0]) > 0.0
     for name, value in model.cost_critic.state_dict().items():
         assert th.equal(value, again.cost_critic.state_dict()[name]), name
     moments, loaded = (one.cost_critic.optimizer.state_dict() for one in (model, again))

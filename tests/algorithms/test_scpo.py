@@ -11,8 +11,8 @@ from known_optima import Outcomes, problems, solve
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_guard import CPO, SCPO, CostEvalCallback, evaluate_policy
-from sb3_guard.checks import NumberError
 from sb3_guard.common.vec_budgets import VecMaxCost
+from sb3_guard.errors import NumberError
 
 KEYS = ("cost", "cost_1")
 

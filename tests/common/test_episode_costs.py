@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sb3_guard.checks import NumberError
 from sb3_guard.costs import EpisodeCosts
+from sb3_guard.errors import NumberError
 
 
 @pytest.mark.parametrize("limit_on", ["sum", "max"])

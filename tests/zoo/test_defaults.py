@@ -85,7 +85,7 @@ def shortened(algo: str) -> dict[str, Any]:
 
 
 def weights(model: Any) -> dict[str, np.ndarray]:
-    """All that ``save`` keeps of networks, multipliers and optimizers."""
+    """All that ``save`` keeps of networks and optimizers."""
     arrays: dict[str, np.ndarray] = {}
     for name, state in model.get_parameters().items():
         entries = state.items() if isinstance(state, dict) else [("", state)]

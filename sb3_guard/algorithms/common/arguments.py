@@ -19,8 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_guard.fields import fit
-from sb3_guard.spelling import did_you_mean
+from sb3_guard.fields import did_you_mean, fit
 
 # Arguments that SB3's own base classes take from the algorithms, not from users.
 _INTERNAL = {"supported_action_spaces", "monitor_wrapper", "support_multi_env", "sde_support"}
@@ -137,3 +136,21 @@ def check_names(cls: type, given: Iterable[str]) -> None:
             raise TypeError(
                 f"{cls.__name__} takes no argument {name!r}; {did_you_mean(name, public)}"
             )
+
+
+def check_stated(algorithm: Any) -> None:
+    """
+    Give the stated hyperparameters their types.
+
+    :param algorithm: a new one, or one that has the attributes of a file
+    :raises ValueError: one is not what its annotation and range allow, or another algorithm has
+        written the file
+    """
+    cls = type(algorithm)
+    if algorithm.saved_as not in {base.__name__ for base in cls.__mro__}:
+        raise ValueError(f"the file holds an agent of {algorithm.saved_as}, not of {cls.__name__}")
+    arguments = inspect.signature(cls).parameters
+    for name, parameter in stated(cls).items():
+        if name in arguments:  # else a class on the way fills it in
+            hint = arguments[name].annotation
+            setattr(algorithm, name, parameter.fitted(name, getattr(algorithm, name), hint))

@@ -19,14 +19,14 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from sb3_guard.algorithms.common.arguments import (
     check_names,
+    check_stated,
     documentation,
     hyperparameter,
     signature,
     stated,
 )
 from sb3_guard.algorithms.common.costs import CostBar, Costs, scheduled_limits, time_limit
-from sb3_guard.checks import check_cost_keys
-from sb3_guard.costs import read_costs
+from sb3_guard.costs import check_cost_keys, read_costs
 from sb3_guard.judging import Limits
 from sb3_guard.vector import as_vec_env, lacks_statistics, moments_of, normalizer_of
 
@@ -100,6 +100,7 @@ class Constrained(BaseAlgorithm):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._warned: set[str] = set()
+        self.saved_as = type(self).__name__  # by the class that wrote the file, after `load`
         self.learnt_normalized = False
         # `load` builds the model later, with the limit of the file.
         new = kwargs.get("_init_setup_model", True)
@@ -130,6 +131,7 @@ class Constrained(BaseAlgorithm):
         :param kwargs: arguments to change, such as ``cost_limit``
         :return: the agent
         :raises TypeError: an argument is not known; the message names the nearest one
+        :raises ValueError: another algorithm has saved the file
         """
         check_names(cls, kwargs.keys() - {"custom_objects", "print_system_info", "force_reset"})
         if "policy_kwargs" in kwargs:  # SB3 compares them with those of the file
@@ -147,11 +149,7 @@ class Constrained(BaseAlgorithm):
 
     def _check_hyperparameters(self) -> None:
         """Refuse values that could only fail later or silently do harm."""
-        stated_ones = stated(type(self))
-        for name, parameter in inspect.signature(type(self)).parameters.items():
-            if name in stated_ones:
-                value = stated_ones[name].fitted(name, getattr(self, name), parameter.annotation)
-                setattr(self, name, value)
+        check_stated(self)
         self.cost_keys = check_cost_keys(self.cost_keys)  # loading turns tuples into lists
         for remaining in (1.0, 0.0):
             scheduled_limits(self, remaining)

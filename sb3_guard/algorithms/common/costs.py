@@ -9,8 +9,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import ProgressBarCallback
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_guard.checks import check_per_cost
-from sb3_guard.costs import EpisodeCosts
+from sb3_guard.costs import EpisodeCosts, check_per_cost
 from sb3_guard.vector import step_limits
 
 _NUMBER = r"(-?\d+\.?\d*(?:e[+-]?\d+)?)"

@@ -19,7 +19,7 @@ from sb3_guard.algorithms.common.policies import (
     FilteredPolicy,
 )
 from sb3_guard.algorithms.common.trust_region import TrustRegion
-from sb3_guard.checks import check_per_cost
+from sb3_guard.costs import check_per_cost
 from sb3_guard.fields import fit
 
 

@@ -4,9 +4,6 @@ from collections.abc import Iterable
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-import torch as th
-from stable_baselines3.common.utils import update_learning_rate
-from torch import nn
 
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.constrained import Constrained
@@ -17,7 +14,7 @@ HIGHEST = 5.0  # in standard deviations of the advantages, or of Q
 SLOW = 0.95  # what the slow average of J_C keeps in an update
 
 
-class Multiplier(nn.Module):
+class Multiplier:
     """One λ ≥ 0 per constraint, raised while its limit is broken and lowered while it holds.
 
     With violation Δ = J_C - d, in units of an episode's cost or of the limit, an update is
@@ -30,80 +27,60 @@ class Multiplier(nn.Module):
     arXiv 2007.03964, algorithm 2).
 
     :param n_costs: number m of constraints
-    :param rate: η
     :param init: λ before the first update
-    :param maximum: bound on λ and I; None for none
-    :param proportional: K_P
-    :param derivative: K_D
-    :param smoothing: share of its old value that an average keeps in an update; 0 for none
-    :param relative: measure costs in units of the limit (of a slow average of J_C where that is 0)
-        and count violations of more than one unit as one, so that neither the unit of cost nor how
-        far away training begins matters; J̄_C is in units of the slow average where that is larger
     """
 
-    def __init__(
+    def __init__(self, n_costs: int, init: float = 0.0) -> None:
+        #: λ and I, shape (m,)
+        self.value = self.integral = np.full(n_costs, float(init))
+        # Averages, NaN before the first update: of J_C, slow and as smooth as the law says, and Δ̄
+        self.slow_cost = self.smooth_cost = self.violation = np.full(n_costs, np.nan)
+
+    def update(
         self,
-        n_costs: int,
+        cost: np.ndarray,
+        limit: np.ndarray,
         rate: float,
         *,
-        init: float = 0.0,
         maximum: float | None = None,
         proportional: float = 0.0,
         derivative: float = 0.0,
         smoothing: float = 0.0,
         relative: bool = False,
     ) -> None:
-        super().__init__()
-        self.maximum = maximum
-        self.proportional = proportional
-        self.derivative = derivative
-        self.smoothing = smoothing
-        self.relative = relative
-        start = th.full((n_costs,), float(init), dtype=th.float64)
-        unknown = th.full_like(start, np.inf)
-        self.integral = nn.Parameter(start)
-        self.register_buffer("value", start.clone())
-        self.register_buffer("slow_cost", unknown.clone())
-        self.register_buffer("violation", unknown.clone())
-        # The average of the last update; before the first one nothing has risen.
-        self.register_buffer("last_costs", unknown[None].clone())
-        self.optimizer = th.optim.SGD([self.integral], lr=rate)
-
-    value: th.Tensor
-    slow_cost: th.Tensor
-    violation: th.Tensor
-    last_costs: th.Tensor
-
-    @th.no_grad()
-    def update(self, cost: np.ndarray, limit: np.ndarray) -> None:
         """Follow the violation.
 
         :param cost: J_C, shape (m,)
         :param limit: d, shape (m,)
+        :param rate: η
+        :param maximum: bound on λ and I; None for none
+        :param proportional: K_P
+        :param derivative: K_D
+        :param smoothing: share of its old value that an average keeps in an update; 0 for none
+        :param relative: measure costs in units of the limit (of a slow average of J_C where that is
+            0) and count violations of more than one unit as one, so that neither the unit of cost
+            nor how far away training begins matters; J̄_C is in units of the slow average where
+            that is larger
         """
-        now, bound = th.tensor(cost), th.tensor(limit)
-        self.slow_cost.copy_(_average(self.slow_cost, now, SLOW))
-        violation = now - bound
-        if self.relative:
-            unit = th.where(bound == 0.0, self.slow_cost, bound).abs()
+        self.slow_cost = _average(self.slow_cost, cost, SLOW)
+        violation = cost - limit
+        if relative:
+            unit = np.abs(np.where(limit == 0.0, self.slow_cost, limit))
             unit[unit == 0.0] = 1.0  # neither cost nor limit: nothing is violated
-            violation = (violation / unit).clamp_(-1.0, 1.0)
-            now = now / unit.maximum(self.slow_cost.abs())  # far from a limit, its own size
-        self.integral.grad = -violation
-        self.optimizer.step()
-        self.integral.clamp_(0.0, self.maximum)
-        self.violation.copy_(_average(self.violation, violation, self.smoothing))
-        smooth = _average(self.last_costs[0], now, self.smoothing)
-        rise = (smooth - self.last_costs[0]).clamp_(min=0.0)
-        self.last_costs.copy_(smooth[None])
-        correction = self.proportional * self.violation + self.derivative * rise
-        self.value.copy_(self.integral + correction)
-        self.value.clamp_(0.0, self.maximum)
+            violation = np.clip(violation / unit, -1.0, 1.0)
+            # Far from a limit, its own size
+            cost = cost / np.maximum(unit, np.abs(self.slow_cost))
+        self.integral = np.clip(self.integral + rate * violation, 0.0, maximum)
+        self.violation = _average(self.violation, violation, smoothing)
+        before, self.smooth_cost = self.smooth_cost, _average(self.smooth_cost, cost, smoothing)
+        rise = np.fmax(self.smooth_cost - before, 0.0)  # 0 in the first update
+        correction = proportional * self.violation + derivative * rise
+        self.value = np.clip(self.integral + correction, 0.0, maximum)
 
 
-def _average(before: th.Tensor, now: th.Tensor, keep: float) -> th.Tensor:
+def _average(before: np.ndarray, now: np.ndarray, keep: float) -> np.ndarray:
     """The next value of an exponential average whose first is the first it meets."""
-    return th.where(th.isinf(before), now, keep * before + (1.0 - keep) * now)
+    return np.where(np.isnan(before), now, keep * before + (1.0 - keep) * now)
 
 
 class Lagrangian(Constrained):
@@ -144,26 +121,11 @@ class Lagrangian(Constrained):
 
     prices: np.ndarray  # λ of the update under way, shape (m,)
 
+    multiplier: Multiplier = None  # type: ignore[assignment]
+
     def _setup_model(self) -> None:
         super()._setup_model()
-        relative = self.lambda_units == "relative"
-        highest = self.lambda_max
-        if relative and highest is None:
-            highest = max(HIGHEST, self.lambda_init)
-        self.multiplier = Multiplier(
-            len(self.cost_keys),
-            self.lambda_lr,
-            init=self.lambda_init,
-            maximum=highest,
-            proportional=self.proportional_gain,
-            derivative=self.derivative_gain,
-            smoothing=self.lambda_smoothing,
-            relative=relative,
-        )
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        state_dicts, tensors = super()._get_torch_save_params()
-        return [*state_dicts, "multiplier", "multiplier.optimizer"], tensors
+        self.multiplier = self.multiplier or Multiplier(len(self.cost_keys), self.lambda_init)
 
     def step(self, costs: Iterable[np.ndarray] | None = None, rate: float | None = None) -> None:
         """Let the multipliers follow J_C; called once, at the top of ``train``.
@@ -171,15 +133,23 @@ class Lagrangian(Constrained):
         :param costs: J_C of each of their steps, shape (m,); None for one step, with the estimate
         :param rate: η of each step; None for ``lambda_lr``
         """
-        old = self.multiplier.value.clone()
-        # As with the critics' rate: what the attribute says, not what a file has restored.
-        rate = self.lambda_lr if rate is None else rate
-        update_learning_rate(self.multiplier.optimizer, rate)
+        old, relative = self.multiplier.value, self.lambda_units == "relative"
+        highest = self.lambda_max
+        if relative and highest is None:
+            highest = max(HIGHEST, self.lambda_init)
         for cost in [self.costs.episode_cost] if costs is None else costs:
-            self.multiplier.update(cost, self.costs.limits)
-        new = self.multiplier.value
-        self.prices = (new if self.lambda_update == "before" else old).numpy()
-        self._record_per_cost("train/multiplier", self.multiplier.value.numpy())
+            self.multiplier.update(
+                cost,
+                self.costs.limits,
+                self.lambda_lr if rate is None else rate,
+                maximum=highest,
+                proportional=self.proportional_gain,
+                derivative=self.derivative_gain,
+                smoothing=self.lambda_smoothing,
+                relative=relative,
+            )
+        self.prices = self.multiplier.value if self.lambda_update == "before" else old
+        self._record_per_cost("train/multiplier", self.multiplier.value)
 
     def weights(self, spread: np.ndarray | float = 1.0) -> np.ndarray:
         """What each cost weighs against the reward in this update, float32, shape (m,).

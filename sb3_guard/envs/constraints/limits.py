@@ -9,7 +9,7 @@ import numpy as np
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Constraint, Robot, Simulation, World
 from sb3_guard.envs.types import Array
-from sb3_guard.spelling import matching
+from sb3_guard.fields import matching
 
 SLIDE, HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
 

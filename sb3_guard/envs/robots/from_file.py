@@ -15,8 +15,7 @@ from sb3_guard.envs.robots.measure import chain, radius, reached
 from sb3_guard.envs.robots.model_file import ModelFile, settle
 from sb3_guard.envs.robots.robot import PREFIX, MJCFRobot
 from sb3_guard.envs.types import Array
-from sb3_guard.fields import fit
-from sb3_guard.spelling import did_you_mean
+from sb3_guard.fields import did_you_mean, fit
 
 OF_FILE = ("root", "complete", "keyframe")  # what settle() is told
 #: What a user may state: what holds if it is not stated, what it is, and what it may be, see

@@ -12,7 +12,7 @@ import numpy as np
 from sb3_guard.envs.robots import mjcf
 from sb3_guard.envs.robots.measure import lowest
 from sb3_guard.envs.types import FLOOR, ROBOT, Array
-from sb3_guard.spelling import did_you_mean
+from sb3_guard.fields import did_you_mean
 
 FREE, BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)

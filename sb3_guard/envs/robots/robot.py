@@ -47,7 +47,7 @@ from sb3_guard.envs.part import FRICTION, MASS, Robot, Simulation, World
 from sb3_guard.envs.robots import sensors
 from sb3_guard.envs.robots.model_file import BALL, FREE, HINGE, SLIDE, ModelFile, settle
 from sb3_guard.envs.types import Array, Generators
-from sb3_guard.spelling import did_you_mean
+from sb3_guard.fields import did_you_mean
 
 Vector = tuple[float, float, float]
 PREFIX = "robot/"

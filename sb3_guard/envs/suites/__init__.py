@@ -7,8 +7,8 @@ the commands, with the keywords that change parameters.
 
 from sb3_guard.envs.suites import guard, safety_gymnasium, velocity
 from sb3_guard.envs.suites.suite import EPISODE_STEPS, Fields, Suite
+from sb3_guard.fields import did_you_mean, nearest
 from sb3_guard.ids import UnknownId, with_version
-from sb3_guard.spelling import did_you_mean, nearest
 
 __all__ = ["EPISODE_STEPS", "SUITES", "Suite", "env_ids", "episode_steps", "fields"]
 

@@ -9,8 +9,8 @@ from itertools import product
 
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
 from sb3_guard.envs.suites.suite import Fields, Suite
+from sb3_guard.fields import did_you_mean
 from sb3_guard.ids import IMPORT_FIRST, UnknownPart
-from sb3_guard.spelling import did_you_mean
 
 LADDER = (1, 2, 4, 8, 16)  # numbers of a constraint's objects, by growing difficulty
 SUITE_TASKS = ("Goal", "Push", "Chase", "Defense")

@@ -8,8 +8,8 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_guard.common.certificate import Certificate
+from sb3_guard.fields import did_you_mean
 from sb3_guard.ids import with_version
-from sb3_guard.spelling import did_you_mean
 from sb3_guard.vector import normalizer_of
 from sb3_guard.zoo.cli.markdown import table
 from sb3_guard.zoo.cli.usage import UsageError

@@ -36,8 +36,7 @@ import typing
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Literal, NoReturn, Self
 
-from sb3_guard.fields import fit, parse_value
-from sb3_guard.spelling import did_you_mean, nearest
+from sb3_guard.fields import did_you_mean, fit, nearest, parse_value
 from sb3_guard.zoo.cli.usage import UsageError, run
 
 # Roles of a flag: it says what a run is, how it is started, or how it is hosted and watched,

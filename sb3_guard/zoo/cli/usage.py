@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from sb3_guard.plain_yaml import load_yaml
+from sb3_guard.fields import load_yaml
 
 
 class UsageError(Exception):

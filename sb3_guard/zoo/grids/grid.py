@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from sb3_guard.spelling import did_you_mean
+from sb3_guard.fields import did_you_mean
 from sb3_guard.zoo.cli.usage import UsageError, explained, interrupts, one_line
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.flags import RunFlags

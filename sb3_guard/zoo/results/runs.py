@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from sb3_guard.fields import did_you_mean
 from sb3_guard.judging import named
-from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.usage import UsageError, explained, one_line
 from sb3_guard.zoo.run.folder import RunFolder
 

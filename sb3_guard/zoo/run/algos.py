@@ -3,7 +3,7 @@
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_guard.algorithms import ALGORITHMS
-from sb3_guard.spelling import did_you_mean
+from sb3_guard.fields import did_you_mean
 from sb3_guard.zoo.cli.usage import UsageError
 
 

@@ -38,7 +38,7 @@ REPLAY_BUFFER = "replay_buffer.pkl"
 LARGEST_SHARE = 0.05
 # The tensors with gSDE's noise, of all environments and of one each.
 GSDE_NOISE = "exploration_mat", "exploration_matrices"
-FORMAT = 10  # increased when the content changes: no other can be continued
+FORMAT = 11  # increased when the content changes: no other can be continued
 
 
 # What a new environment brings itself and what need not be picklable.

@@ -29,8 +29,7 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_guard.algorithms import ALGORITHMS, TrustRegion
 from sb3_guard.algorithms.common.arguments import signature
-from sb3_guard.fields import fit, is_data
-from sb3_guard.spelling import did_you_mean
+from sb3_guard.fields import did_you_mean, fit, is_data
 from sb3_guard.zoo.cli.names import (
     PAPER,
     as_data,

@@ -4,8 +4,8 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_guard.checks import ContractError, WorldError
 from sb3_guard.common.sources import Source, find
+from sb3_guard.errors import ContractError, WorldError
 from sb3_guard.zoo.cli.usage import UsageError, explained
 
 # What ends a training in a line: the message says all that a traceback would, and the remedy.

@@ -16,8 +16,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 import sb3_guard
 from sb3_guard.algorithms.common.costs import limits_at
-from sb3_guard.checks import NumberError
 from sb3_guard.common.monitor import cost_keys_of, find_monitor
+from sb3_guard.errors import NumberError
 from sb3_guard.judging import Mean
 from sb3_guard.zoo.run.folder import EPOCH
 

@@ -233,7 +233,7 @@ def certify(
     :param cost_keys: entries of info that are costs; None: those of the model or the environment
     :param seed: the episodes' seeds are drawn from it, and are not those that training or
         evaluation with the same seed draw; None draws one
-    :param error: probability of a false certificate, below 0.5
+    :param error: probability of a false certificate, from 1e-12 to 0.5
     :param tries: how many agents share this error, such as candidates of one training. If there
         are others, one whose mean is above the limit at a look is not looked at again
     :param most: highest possible cost of an episode, for an exact bound; costs are at least 0
@@ -244,7 +244,7 @@ def certify(
     """
     fit("n_episodes", n_episodes, int, LEAST, ends="[)")
     fit("tries", tries, int, 1, ends="[)")
-    fit("error", error, float, 0.0, 0.5)
+    fit("error", error, float, 1e-12, 0.5)
     env = as_vec_env(env)
     refuse_training_only(env)
     keys = check_cost_keys(cost_keys_of(model, env) if cost_keys is None else cost_keys)

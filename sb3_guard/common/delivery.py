@@ -177,7 +177,8 @@ class DeliveryCallback(CostEvalCallback):
                 content = th.load(file, map_location="cpu", weights_only=True)
             except Exception:  # a damaged file raises what its bytes make of pickle and zip
                 continue
-            if isinstance(content, dict) and content.get("format") == FORMAT:
+            ours = isinstance(content, dict) and content.get("format") == FORMAT
+            if ours and isinstance(content["num_timesteps"], int):
                 there.append((file, content))
         return sorted(there, key=lambda entry: entry[1]["num_timesteps"])
 
@@ -285,9 +286,10 @@ class DeliveryCallback(CostEvalCallback):
         return int(content["num_timesteps"])
 
     def _withdraw(self) -> None:
-        """Remove the agent of an earlier training."""
-        for name in (CERTIFICATE, NORMALIZER, MODEL):  # without the first they are not taken
-            (self.folder / name).unlink(missing_ok=True)
+        """Remove the agent of an earlier training, if there is one."""
+        if (self.folder / CERTIFICATE).exists():
+            for name in (CERTIFICATE, NORMALIZER, MODEL):  # without the first they are not taken
+                (self.folder / name).unlink(missing_ok=True)
 
     def _write(self, certificate: Certificate, steps: int) -> None:
         """Put the certified agent into the place of an earlier one."""
@@ -300,12 +302,13 @@ class DeliveryCallback(CostEvalCallback):
         contents[MODEL] = model.getvalue()
         with ExitStack() as files:
             # Until all are written the earlier agent stays. Then the files take their names, in
-            # reverse: the certificate, which vouches for the others, is the last one.
+            # reverse: until the certificate does, the earlier one is of another agent.
             for name, content in contents.items():
                 file = files.enter_context(replacing(self.folder / name))
                 file.write(content)
                 file.flush()
-            self._withdraw()
+        if NORMALIZER not in contents:  # that of the earlier agent
+            (self.folder / NORMALIZER).unlink(missing_ok=True)
         self.certificate = certificate
 
 

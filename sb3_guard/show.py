@@ -77,8 +77,7 @@ def costs(env: GuardVectorEnv, env_id: str | None) -> Iterator[str]:
         yield f"Usual cost limit of an episode: {values['cost_limit']:g}."
     elif parts:
         yield "No cost limit is usual here: choose cost_limit."
-    steps = env.max_episode_steps
-    yield f"An episode has {steps} steps of {env.engine.control_step:g} s."
+    yield f"An episode has {env.max_episode_steps} steps of {env.engine.control_step:g} s."
 
 
 @dataclass

@@ -404,7 +404,7 @@ def test_boxes_of_any_size(cls: Any) -> None:
     env = make_vec_env(lambda: RandomCostEnv(STATE, box), 2, seed=0)  # refuses others
     model = make(cls, env, threshold=-1.0).learn(240)
     assert model.logger.name_to_value["train/corrected_fraction"] > 0.5
-    unit = model.policy.to_unit(th.tensor([[-5.0, 0.1], [-2.0, 0.05]]))
+    unit = model.policy.box.unit(th.tensor([[-5.0, 0.1], [-2.0, 0.05]]))
     np.testing.assert_allclose(unit, [[-1, 1], [0, 0]], atol=1e-6)
     action, _ = model.predict(env.reset())
     assert all(box.contains(each) for each in action)

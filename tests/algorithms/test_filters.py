@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from agents import points
 from cost_envs import CostPoint, RandomCostEnv, Wall
 from gymnasium import spaces
 from scipy.optimize import minimize
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv
 from torch.nn import functional as F
 
 from sb3_guard.algorithms import TRPOSL, TRPOUSL
@@ -27,12 +28,6 @@ from sb3_guard.common.evaluation import evaluate_policy
 
 CLASSES = [TRPOSL, TRPOUSL]
 STATE = spaces.Box(-np.inf, np.inf, (4,), np.float32)
-
-
-def points(n_envs: int = 2, **kwargs: Any) -> VecEnv:
-    """Episodes start inside a hazard: there is always a cost to learn from."""
-    options = {"episode_length": 30, "hazard": (-1.0, 0.0), **kwargs}
-    return make_vec_env(lambda: CostPoint(**options), n_envs, seed=0)
 
 
 def make(cls: Any, env: Any = None, policy: Any = "MlpPolicy", **kwargs: Any) -> Any:

@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch as th
-from cost_envs import CostPoint
+from agents import points
 from gymnasium import spaces
 from known_optima import Outcomes, problems
 from sb3_contrib import TQC
@@ -48,10 +48,6 @@ every = pytest.mark.parametrize("cls", [SACLag, TD3Lag, TQCLag])
 shared = pytest.mark.parametrize(
     "cls", [TD3Lag, *(pytest.param(cls, marks=pytest.mark.slow) for cls in (SACLag, TQCLag))]
 )
-
-
-def points(n_envs: int = 2, **kwargs: Any) -> Any:
-    return make_vec_env(lambda: CostPoint(30, hazard=(-1.0, 0.0), **kwargs), n_envs, seed=0)
 
 
 def noise(n: int = 2) -> NormalActionNoise:

@@ -241,9 +241,6 @@ def is_number(value: Any) -> bool:
     return number and bool(np.isfinite(value))
 
 
-# Names
-
-
 def nearest(name: str, known: Iterable[str]) -> str | None:
     """The allowed name that ``name`` most likely meant, whatever its case; None: nothing is near.
 
@@ -281,9 +278,6 @@ def matching(label: str, pattern: str, known: Iterable[str]) -> list[str]:
     if not names:
         raise ValueError(f"{label} matches no name {pattern!r}: {did_you_mean(pattern, known)}")
     return names
-
-
-# YAML
 
 
 # In C where libyaml is there, ten times as fast: a large grid reads a thousand files.

@@ -17,30 +17,7 @@ from stable_baselines3.td3.policies import Actor as TD3Actor
 from torch import nn
 
 from sb3_guard.algorithms.common.action_filters import SafetyLayer
-from sb3_guard.algorithms.common.policies import FilteredPolicy
-
-
-class Box(nn.Module):
-    """The bounds of actions.
-
-    :param space: the action space
-    """
-
-    low: th.Tensor
-    high: th.Tensor
-
-    def __init__(self, space: spaces.Box) -> None:
-        super().__init__()
-        self.register_buffer("low", th.as_tensor(space.low.flatten()).float())
-        self.register_buffer("high", th.as_tensor(space.high.flatten()).float())
-
-    def clip(self, actions: th.Tensor) -> th.Tensor:
-        """Actions inside the bounds, [B, k]."""
-        return th.minimum(th.maximum(actions, self.low), self.high)
-
-    def scale(self, unit: th.Tensor) -> th.Tensor:
-        """Actions of the environment from those in [-1, 1], [B, k]."""
-        return self.low + 0.5 * (unit + 1.0) * (self.high - self.low)
+from sb3_guard.algorithms.common.policies import Box, FilteredPolicy
 
 
 class Actor(nn.Module):

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
-from cost_envs import SB3_POLICY, CostPoint, LinearCostBandit
+from agents import points, state_of
+from cost_envs import SB3_POLICY, LinearCostBandit
 from ppo_lagrangian import PPOLagrangian
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
@@ -25,23 +26,11 @@ from sb3_guard.algorithms import (
 from sb3_guard.algorithms.common.first_order import mean_kl
 
 
-def points(n_envs: int = 4, **kwargs: Any) -> Any:
-    return make_vec_env(lambda: CostPoint(30, hazard=(-1.0, 0.0), **kwargs), n_envs, seed=0)
-
-
-def state_of(model: Any) -> list[Any]:
-    """Weights, optimizer and generators as plain values."""
-    optimizer = model.policy.optimizer.state_dict()["state"]
-    moments = [value for entry in optimizer.values() for value in entry.values()]
-    tensors = [*model.policy.state_dict().values(), *moments, th.get_rng_state()]
-    return [*(tensor.tolist() for tensor in tensors), random.getstate(), np.random.get_state()[2]]  # noqa: NPY002
-
-
 def test_without_a_price_it_is_sb3s_ppo_bit_for_bit() -> None:
     """Episodes are cut by a time limit of 30 steps."""
     kwargs: dict[str, Any] = {"n_steps": 32, "batch_size": 64, "seed": 0, "device": "cpu"}
-    a = state_of(PPO("MlpPolicy", points(), **kwargs).learn(256))
-    model = PPOLagrangian("MlpPolicy", points(), cost_limit=1e6, **kwargs).learn(256)
+    a = state_of(PPO("MlpPolicy", points(4), **kwargs).learn(256))
+    model = PPOLagrangian("MlpPolicy", points(4), cost_limit=1e6, **kwargs).learn(256)
     assert a == state_of(model)
     assert model.total_cost > 0.0 and float(model.multiplier.value[0]) == 0.0
     assert model.logger.name_to_value["train/cost_value_loss"] > 0.0
@@ -51,8 +40,8 @@ def test_first_order_with_ppos_loss_is_ppo_bit_for_bit() -> None:
     kwargs: dict[str, Any] = {"n_steps": 32, "batch_size": 48, "seed": 0, "device": "cpu"}
     kwargs |= {"target_kl": None, "clip_range_vf": 0.1, "ent_coef": 0.01, "gae_lambda": 0.9}
     kwargs["policy_kwargs"] = SB3_POLICY
-    model = FirstOrder("MlpPolicy", points(), cost_limit=1.0, **kwargs)
-    models = [PPO("MlpPolicy", points(), **kwargs), model]
+    model = FirstOrder("MlpPolicy", points(4), cost_limit=1.0, **kwargs)
+    models = [PPO("MlpPolicy", points(4), **kwargs), model]
     states = []
     for model in models:
         model.set_random_seed(0)
@@ -71,7 +60,7 @@ def test_passes_stop_by_the_kl_of_the_rollout() -> None:
     """One pass where the first already goes too far, all where none does."""
     for target, passes in ((1e-9, 1), (1e9, 10)):
         kwargs: dict[str, Any] = {"n_steps": 32, "target_kl": target, "cost_limit": 1e6, "seed": 0}
-        model = FirstOrder("MlpPolicy", points(), **kwargs).learn(128)
+        model = FirstOrder("MlpPolicy", points(4), **kwargs).learn(128)
         assert model._n_updates == passes and 0.0 < mean_kl(model) < 1.0
 
 

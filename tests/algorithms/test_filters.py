@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from agents import points
 from cost_envs import CostPoint, RandomCostEnv, Wall
 from gymnasium import spaces
 from scipy.optimize import minimize
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv
 from torch.nn import functional as F
 
 from sb3_guard.algorithms import TRPOSL, TRPOUSL
@@ -27,12 +28,6 @@ from sb3_guard.common.evaluation import evaluate_policy
 
 CLASSES = [TRPOSL, TRPOUSL]
 STATE = spaces.Box(-np.inf, np.inf, (4,), np.float32)
-
-
-def points(n_envs: int = 2, **kwargs: Any) -> VecEnv:
-    """Episodes start inside a hazard: there is always a cost to learn from."""
-    options = {"episode_length": 30, "hazard": (-1.0, 0.0), **kwargs}
-    return make_vec_env(lambda: CostPoint(**options), n_envs, seed=0)
 
 
 def make(cls: Any, env: Any = None, policy: Any = "MlpPolicy", **kwargs: Any) -> Any:
@@ -404,7 +399,7 @@ def test_boxes_of_any_size(cls: Any) -> None:
     env = make_vec_env(lambda: RandomCostEnv(STATE, box), 2, seed=0)  # refuses others
     model = make(cls, env, threshold=-1.0).learn(240)
     assert model.logger.name_to_value["train/corrected_fraction"] > 0.5
-    unit = model.policy.to_unit(th.tensor([[-5.0, 0.1], [-2.0, 0.05]]))
+    unit = model.policy.box.unit(th.tensor([[-5.0, 0.1], [-2.0, 0.05]]))
     np.testing.assert_allclose(unit, [[-1, 1], [0, 0]], atol=1e-6)
     action, _ = model.predict(env.reset())
     assert all(box.contains(each) for each in action)

@@ -1,25 +1,22 @@
 """TRPO-IPO: its barrier, the weight it puts on the cost, and its line search."""
 
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
+import agents
 import numpy as np
 import pytest
 import torch as th
-from cost_envs import CostPoint, told
-from stable_baselines3.common.env_util import make_vec_env
+from agents import batch_of
+from cost_envs import told
 from stable_baselines3.common.logger import Logger
 
 from sb3_guard.algorithms import TRPOIPO
 from sb3_guard.algorithms.common.actor import Trial
 from sb3_guard.algorithms.trpo_ipo import barrier
 
-
-def make(n_costs: int = 1, **kwargs: Any) -> Any:
-    keys = ("cost", "cost_1")[:n_costs]
-    env = make_vec_env(lambda: CostPoint(cost_keys=keys, hazard=(-1.0, 0.0)), 4, seed=0)
-    defaults: dict[str, Any] = {"n_steps": 100, "n_critic_updates": 5, "seed": 0, "device": "cpu"}
-    return TRPOIPO("MlpPolicy", env, cost_keys=keys, **{**defaults, **kwargs})
+make: Any = partial(agents.make, TRPOIPO)
 
 
 @pytest.mark.parametrize(("t", "slope"), [(0.01, 0.5), (100.0, 20.0)])
@@ -54,20 +51,16 @@ def _accept(model: Any) -> Any:
 def _weight(model: Any, cost: float, scale: float = 1.0) -> float:
     """What a standard deviation of A_C weighs in the gradient of the surrogate."""
     _estimate(model, [cost], 40.0)
-
-    class Batch:
-        advantages = th.zeros(200)
-        cost_advantages = scale * th.randn(200, 1, generator=th.Generator().manual_seed(0))
-
-    Batch.cost_advantages -= Batch.cost_advantages.mean()
-    deviation = Batch.cost_advantages.std()
+    costs = scale * th.randn(200, 1, generator=th.Generator().manual_seed(0))
+    batch = batch_of(th.zeros(200), costs - costs.mean())
+    deviation = costs.std()
     ratio = th.ones(200, requires_grad=True)
-    (found,) = th.autograd.grad(model.surrogate(Batch, ratio), ratio)
-    shape = Batch.cost_advantages[:, 0] / deviation
+    (found,) = th.autograd.grad(model.surrogate(batch, ratio), ratio)
+    shape = batch.cost_advantages[:, 0] / deviation
     weight = float(-200 * (found @ shape) / (shape @ shape))
     th.testing.assert_close(found, -weight * shape / 200)
     model.set_logger(Logger(None, []))
-    model.fit(Batch)
+    model.fit(batch)
     price = model.logger.name_to_value["train/cost_weight"]
     assert price * float(deviation) == pytest.approx(weight, rel=1e-4), "per unit of the advantage"
     return weight
@@ -96,11 +89,7 @@ def test_several_barriers_are_sharper() -> None:
     model = make(2, cost_limit=[5.0, 9.0], t=2.0, max_multiplier=3.0)
     _estimate(model, [0.0, 8.0], 40.0)
     model.set_logger(Logger(None, []))
-
-    class Batch:
-        cost_advantages = th.tensor([[1.0, 10.0], [-1.0, -10.0], [0.0, 0.0]])
-
-    model.fit(Batch)
+    model.fit(batch_of([0.0] * 3, [[1.0, 10.0], [-1.0, -10.0], [0.0, 0.0]]))
     logged = model.logger.name_to_value
     weights = [logged[f"train/multiplier/{key}"] for key in model.cost_keys]
     assert weights == pytest.approx([1 / 4, 9 / 4])
@@ -111,15 +100,11 @@ def test_several_barriers_are_sharper() -> None:
 def test_several_barriers_add_up() -> None:
     model = make(2, cost_limit=[5.0, 9.0], t=2.0, max_multiplier=3.0, units="cost")
     _estimate(model, [4.0, 80.0], 40.0)
-
-    class Batch:
-        advantages = th.randn(200)
-        cost_advantages = th.randn(200, 2)
-
+    batch = batch_of(th.randn(200), th.randn(200, 2))
     ratio = th.ones(200, requires_grad=True)
-    (found,) = th.autograd.grad(model.surrogate(Batch, ratio), ratio)
-    expected = Batch.advantages - 0.5 * Batch.cost_advantages[:, 0]
-    expected -= 3.0 * Batch.cost_advantages[:, 1]
+    (found,) = th.autograd.grad(model.surrogate(batch, ratio), ratio)
+    expected = batch.advantages - 0.5 * batch.cost_advantages[:, 0]
+    expected -= 3.0 * batch.cost_advantages[:, 1]
     th.testing.assert_close(found, expected / 200)
 
 

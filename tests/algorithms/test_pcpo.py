@@ -1,14 +1,15 @@
 """PCPO: its projection against an independent optimiser, and its line search."""
 
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
+import agents
 import numpy as np
 import pytest
 import torch as th
-from cost_envs import CostPoint, told
+from cost_envs import told
 from scipy.optimize import minimize
-from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
 from step_problems import StepProblem
 
@@ -152,9 +153,7 @@ def test_without_cost_gradient(c: float) -> None:
     assert not pull.any()
 
 
-def make(**kwargs: Any) -> PCPO:
-    env = make_vec_env(lambda: CostPoint(hazard=(-1.0, 0.0)), 4, seed=0)
-    return PCPO("MlpPolicy", env, n_steps=100, n_critic_updates=5, seed=0, device="cpu", **kwargs)
+make: Any = partial(agents.make, PCPO)
 
 
 def acceptance(model: PCPO) -> Any:

@@ -339,9 +339,6 @@ REFUSED = {
     "a function of single ones": (lambda: CostFromFunction(sync(), far), "Expected env to be a"),
     "made already": (lambda: make_vec_env(sync(), 2), "SyncVectorEnv is made already"),
     "no cost": (lambda: CPO("MlpPolicy", Batch(), **SMALL).learn(20), "no cost key 'cost'"),
-    "discrete actions": (
-        lambda: SACLag("MlpPolicy", Batch(moved="discrete"), cost_limit=1.0), "needs continuous",
-    ),
     "a cost of other rows": (
         lambda: CPO("MlpPolicy", GymnasiumVecEnv(sync(), lambda *_: 1.0), **SMALL).learn(20),
         r"returned shape \(\), expected \(3,\)",

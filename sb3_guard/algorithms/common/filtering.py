@@ -116,7 +116,7 @@ class FilteredTrustRegion(TrustRegion):
     def _unit(self, actions: np.ndarray) -> th.Tensor:
         """Actions of the environment in units of the action space, shape [B, k]."""
         flat = th.as_tensor(actions.reshape(len(actions), -1), dtype=th.float32)
-        return self.policy.to_unit(flat.to(self.device))
+        return self.policy.box.unit(flat.to(self.device))
 
     def _executed(self, batch: CostRolloutBufferSamples) -> th.Tensor:
         """The executed actions of a batch in units of the action space, shape [B, k]."""

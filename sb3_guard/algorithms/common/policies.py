@@ -12,8 +12,38 @@ from stable_baselines3.common.policies import (
     MultiInputActorCriticPolicy,
 )
 from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
 
 from sb3_guard.algorithms.common.action_filters import ActionFilter
+
+
+class Box(nn.Module):
+    """The bounds of actions, which no file keeps: the action space has them.
+
+    :param space: the action space
+    """
+
+    low: th.Tensor
+    high: th.Tensor
+
+    def __init__(self, space: spaces.Box) -> None:
+        super().__init__()
+        for name in ("low", "high"):
+            bound = th.as_tensor(getattr(space, name).flatten()).float()
+            self.register_buffer(name, bound, persistent=False)
+
+    def clip(self, actions: th.Tensor) -> th.Tensor:
+        """Actions inside the bounds, [B, k]."""
+        return th.minimum(th.maximum(actions, self.low), self.high)
+
+    def scale(self, unit: th.Tensor) -> th.Tensor:
+        """Actions of the environment from those in [-1, 1], [B, k]."""
+        return self.low + 0.5 * (unit + 1.0) * (self.high - self.low)
+
+    def unit(self, actions: th.Tensor) -> th.Tensor:
+        """The other way round, [B, k]."""
+        half = ((self.high - self.low) / 2.0).clamp(min=th.finfo(th.float32).tiny)
+        return (actions - self.low) / half - 1.0
 
 
 class FilteredPolicy(ActorCriticPolicy):
@@ -30,8 +60,7 @@ class FilteredPolicy(ActorCriticPolicy):
     """
 
     action_filter: Any  #: an :class:`~sb3_guard.algorithms.common.action_filters.ActionFilter`
-    low: th.Tensor
-    high: th.Tensor
+    box: Box
     _filter: tuple[Callable[..., ActionFilter], dict[str, Any]] | None = None
 
     def __init__(
@@ -42,9 +71,7 @@ class FilteredPolicy(ActorCriticPolicy):
     ) -> None:
         super().__init__(*args, **kwargs)
         if isinstance(self.action_space, spaces.Box):
-            for name in ("low", "high"):
-                bound = th.as_tensor(getattr(self.action_space, name).flatten()).float()
-                self.register_buffer(name, bound.to(self.device), persistent=False)
+            self.box = Box(self.action_space).to(self.device)
         if action_filter is not None:
             self.carry(*action_filter)
 
@@ -70,11 +97,6 @@ class FilteredPolicy(ActorCriticPolicy):
         """Whether there is a filter, switched on."""
         return self._filter is not None and bool(self.action_filter.active)
 
-    def to_unit(self, actions: th.Tensor) -> th.Tensor:
-        """Actions of the environment, flat, in units of the action space, shape [B, k]."""
-        half = ((self.high - self.low) / 2.0).clamp(min=th.finfo(th.float32).tiny)
-        return (actions - self.low) / half - 1.0
-
     def executable(self, actions: np.ndarray) -> np.ndarray:
         """Sampled actions, flat or not, as SB3 hands them to the environment, shape [B, …]."""
         assert isinstance(self.action_space, spaces.Box)
@@ -93,12 +115,12 @@ class FilteredPolicy(ActorCriticPolicy):
         :param costs: what the last step cost, shape [B, m], NaN where not known; None if of none
         :return: actions of the environment, flat, shape [B, k]
         """
-        low, high, unit = self.low, self.high, self.to_unit(actions)
+        unit = self.box.unit(actions)
         corrected = self.action_filter(observations, unit, costs)
         # What is not corrected stays as it is, to the last bit.
         moved = (corrected - unit).abs().amax(dim=1, keepdim=True) > 1e-6
-        scaled = (low + 0.5 * (corrected + 1.0) * (high - low)).to(actions)
-        return th.minimum(th.maximum(th.where(moved, scaled, actions), low), high)
+        scaled = self.box.scale(corrected).to(actions)
+        return self.box.clip(th.where(moved, scaled, actions))
 
     @th.no_grad()
     def correct(

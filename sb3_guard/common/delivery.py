@@ -132,7 +132,8 @@ class DeliveryCallback(CostEvalCallback):
             only
         :raises OSError: the folder can't be written, or ``certificate.json`` is of something else
         """
-        self._certified_limits()
+        if not self._certified_limits():
+            raise ValueError("the agent has no cost limit of its own: give cost_limit")
         super()._init_callback()
         if (file := self.folder / CERTIFICATE).exists() and not (self.folder / MODEL).exists():
             raise FileExistsError(f"{file} would be replaced; move it, or choose another folder")

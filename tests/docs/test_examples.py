@@ -27,7 +27,7 @@ SAYS = {
     "custom_constraint": (["steps outside: ["], []),
     "custom_robot": (["26 observations, 2 actions", "return "], ["puck.xml"]),
     "deploy": ([", limit 5.0 per episode"], ["contract.json", "costs.csv", "policy.onnx"]),
-    "several_constraints": (["return", "cost_hazards, limit 5.0", "cost_ghosts, limit 2.0"], []),
+    "several_constraints": (["10 episodes: return"], []),
     "train_cpo": (["ep_cost_mean", ", limit 5; "], ["cpo_point.zip"]),
     "tune_with_optuna": (["0 ", "1 ", "limit"], []),
     "your_own_env": (["costs of episodes: [", "off-policy: [", "steps off the middle: ["], []),

@@ -384,8 +384,7 @@ def test_an_agent_that_does_no_better_than_standing_still_is_told(low, standing,
     run = Run(RunFlags.of({"seed": 0}))
     for better in (0.1, 0.0):
         certificate = SimpleNamespace(mean_return=standing + better)
-        run.delivery = SimpleNamespace(certificate=certificate, eval_env=env)
-        run._beside_standing()
+        run._beside_standing(certificate, env)
         said = f"no better than standing still, of return {standing:.4g} in one episode"
         assert (said in capsys.readouterr().out) == (not better)
     env.action_space = spaces.Discrete(2)

@@ -241,9 +241,7 @@ class Constrained(BaseAlgorithm):
         return total, callback
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> Any:
-        """
-        :raises ValueError: an evaluation has reset the environments since ``learn`` began
-        """
+        """Raise ValueError if an evaluation has reset the environments since ``learn`` began."""
         if self._last_obs is None:
             raise ValueError(BROKEN_OFF)
         self.collecting = True

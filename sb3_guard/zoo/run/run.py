@@ -40,6 +40,7 @@ from stable_baselines3.common.vec_env.vec_video_recorder import VecVideoRecorder
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.algorithms.common.costs import limits_at, time_limit
 from sb3_guard.common.callbacks import CostEvalCallback, LogCosts
+from sb3_guard.common.certificate import Certificate
 from sb3_guard.common.delivery import FINAL_EPISODES, DeliveryCallback, play_final
 from sb3_guard.common.evaluation import (
     Evaluation,
@@ -677,7 +678,8 @@ class Run:
             print(f"{words} at {result['n_timesteps']:,} steps, {seconds:.0f} s")
             print(f"  last epoch         {summary(result)}\n  run folder         {folder.path}")
             if finished:
-                self._beside_standing()
+                if self.delivery and self.delivery.certificate:
+                    self._beside_standing(self.delivery.certificate, self.delivery.eval_env)
                 print(f"  see the agent      {folder.play()}")
             else:
                 print(f"  continue with      {folder.again()}")
@@ -699,12 +701,11 @@ class Run:
             how = f"at least {least:,}, 30 updates of 20 episodes"
         print(f"{words}; {how}")
 
-    def _beside_standing(self) -> None:
+    def _beside_standing(self, certificate: Certificate, env: VecEnv) -> None:
         """Say it where a delivered agent does no better than one that does nothing."""
-        if self.delivery and (certificate := self.delivery.certificate):
-            standing = standing_return(self.delivery.eval_env, evaluation_seed(self.flags.seed))
-            if standing is not None and certificate.mean_return <= standing:
-                print(f"  no better than standing still, of return {standing:.4g} in one episode")
+        standing = standing_return(env, evaluation_seed(self.flags.seed))
+        if standing is not None and certificate.mean_return <= standing:
+            print(f"  no better than standing still, of return {standing:.4g} in one episode")
 
     def _checkpoints(
         self, folder: RunFolder, epochs: Epochs, asked_to_stop: Callable[[], bool]

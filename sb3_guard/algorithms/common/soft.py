@@ -1,6 +1,5 @@
 """SAC's gradient step with costs, which SAC- and TQC-Lagrangian share."""
 
-import re
 from typing import Any
 
 import numpy as np
@@ -40,14 +39,6 @@ class SoftActorCritic(CostReplay):
 
     def __init__(self, *args: Any, ent_coef: str | float = "auto_reward", **kwargs: Any) -> None:
         super().__init__(*args, ent_coef=ent_coef, **kwargs)
-
-    def _check_hyperparameters(self) -> None:
-        super()._check_hyperparameters()
-        if not re.fullmatch(r"auto|auto_reward|(auto_)?\d*\.?\d+(e[+-]?\d+)?", str(self.ent_coef)):
-            raise ValueError(
-                f"ent_coef={self.ent_coef!r}: must be a number of at least 0, 'auto' (learnt, from "
-                "1), 'auto_0.1' (learnt, from 0.1) or 'auto_reward' (from the size of the rewards)"
-            )
 
     def _setup_model(self) -> None:
         start = self.ent_coef

@@ -533,7 +533,7 @@ def test_sampling_draws_what_sb3s_buffer_draws() -> None:
     [
         ({"n_steps": 3, "optimize_memory_usage": True}, "n_steps=3: must be 1 .*optimize_memory"),
         ({"cost_gamma": 1.0}, "cost_gamma = 1.0 must be at least 0 and less than 1"),
-        ({"safety_margin": 1.0}, "safety_margin = 1.0 must be"),
+        ({"env": "CartPole-v1"}, r"^\w+ needs continuous actions \(Box\), not Discrete"),
     ],
 )
 def test_bad_input(more: Any, error: str) -> None:

@@ -2,8 +2,9 @@
 
 Made from the packed logs of the grand table are the overview on the page; all rows,
 ``docs/data/leaderboard.csv``; and ``rows.csv`` in ``sb3_guard/zoo/results`` for ``sb3-guard
-reproduce``. ``--train FOLDER`` trains the grand table, its grids in the order of ``GRIDS``, and continues where it was stopped; ``--pack FOLDER`` packs the logs of the
-runs that are finished there into ``docs/data``.
+reproduce``. ``--train FOLDER`` trains the grand table, its grids in the order of ``GRIDS``, and
+continues where it was stopped; ``--pack FOLDER`` packs the logs of the runs that are finished there
+into ``docs/data``.
 """
 
 import argparse
@@ -46,8 +47,8 @@ GRIDS = (
 )
 FOLDERS = (*dict.fromkeys(folder for _, folder in GRIDS),)
 COLUMNS = [
-    "environment", "million_steps", "place", "algo", "settings", "seeds", "return", "return_std", "cost", "low",
-    "high", "verdict", "above", "excess", "most_likely_return", "most_likely_cost",
+    "environment", "million_steps", "place", "algo", "settings", "seeds", "return", "return_std",
+    "cost", "low", "high", "verdict", "above", "excess", "most_likely_return", "most_likely_cost",
     "most_likely_verdict", "delivered", "cost_total", "row",
 ]  # fmt: skip
 MARKS = {"kept": " ✓", "exceeded": " ✗"}
@@ -118,7 +119,8 @@ def leaderboard(rows: pd.DataFrame) -> pd.DataFrame:
     """
     A row for each environment, budget and algorithm, with the columns that the page explains.
 
-    Rows with a place, their limit kept with enough seeds and today's settings, come first, by return.
+    Rows with a place, their limit kept with enough seeds and today's settings, come first, by
+    return.
     """
     other = rows[rows["split"] == "greedy"].set_index("row")[["return", "cost", "verdict"]]
     final = rows[rows["split"] == "stochastic"].join(other.add_prefix("most_likely_"), on="row")
@@ -147,7 +149,7 @@ def label_of(algo: str) -> str:
 
 
 def glance(rows: pd.DataFrame) -> str:
-    """For each budget, family of tasks and age of settings, a row per algorithm, a column per task."""
+    """For each budget, tasks and age of settings, a row per algorithm and a column per task."""
     if not len(rows):
         return ""
     final = rows[rows["split"] == "stochastic"]

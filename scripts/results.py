@@ -321,9 +321,9 @@ def best(name: str) -> str:
     A row per environment: the highest return of an agent within the limit.
 
     Of the runs of a grid what was certified counts, if half of them deliver, of the leaderboard's
-    rows with today's settings the final policy with sampled actions, which needs three seeds. Where nothing is within the limit, an undecided one
-    stands there, else the lowest cost. Minutes are those of the leaderboard's runs, the median over
-    seeds.
+    rows with today's settings the final policy with sampled actions; both need three seeds. Where
+    nothing is within the limit, an undecided one stands there, else the lowest cost. Minutes are
+    the median over seeds.
     """
     board, runs = pd.read_csv(DATA / "leaderboard.csv"), pd.read_csv(ROWS)
     took = (runs["seconds"] / 60).groupby(runs["row"].str.rsplit("_", n=1).str[0]).median()

@@ -36,13 +36,13 @@ class Flags(Command):
     way. The exit status is 0 if all training and final episodes are the same, or, on another
     processor, if return and cost lie where further seeds of the row would.
 
-    :param row: row of the leaderboard, e.g. grand_table/cpo/SafetyPointGoal1-v0_3
+    :param row: row of the leaderboard, e.g. delivery/cpo/SafetyPointGoal1-v0_3
     :param log_folder: log folder of the new run (default: logs/reproduced)
     """
 
     prog: ClassVar[str] = "sb3-guard reproduce"
     examples: ClassVar[str] = """examples:
-  sb3-guard reproduce grand_table/cpo/SafetyPointGoal1-v0_3
+  sb3-guard reproduce delivery/cpo/SafetyPointGoal1-v0_3
 """
 
     row: str = flag(default="", positional=True, metavar="ROW")

@@ -13,9 +13,14 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import yaml
 
+from sb3_guard.algorithms import TrustRegion
 from sb3_guard.zoo.results.runs import Results, read_results
+from sb3_guard.zoo.run.algos import algorithm
+from sb3_guard.zoo.run.folder import RunFolder
+from sb3_guard.zoo.run.hyperparams import read_hyperparams
 
 DOCS = Path(__file__).parents[1] / "docs"
 DATA = DOCS / "data"
@@ -46,6 +51,36 @@ def unpacked(*names: str) -> Iterator[Results]:
         for file in Path(folder).rglob("result.json"):
             file.write_text(json.dumps(completed(json.loads(file.read_bytes()))))
         yield read_results([folder])
+
+
+def former(result: dict[str, Any]) -> list[str]:
+    """The settings of a run of the grand table that were defaults then and are no more."""
+    if "delivered" in result:  # younger than the last change
+        return []
+    then = ["aim:mean"] if "aim" in read_hyperparams(result["algo"], result["env"]) else []
+    if issubclass(algorithm(result["algo"]), TrustRegion):
+        then += ["batch_size:None", "n_critic_updates:80"]
+    return then
+
+
+def chosen(runs: pd.DataFrame) -> pd.DataFrame:
+    """
+    The runs that answer for an algorithm on an environment after so many steps.
+
+    They are those with today's settings, if there are any, and of several grids' those of the grid
+    with most seeds.
+
+    :return: the runs with ``budget`` (millions of steps) and ``settings``, the former defaults
+    """
+    paths = [Path(path) for path in runs["path"]]
+    runs = runs.assign(
+        settings=[" ".join(former(RunFolder(path).checked_result())) for path in paths],
+        budget=(runs["steps"] / 1e6).round().clip(lower=1).astype(int),
+    )
+    case = [runs[name] for name in ("suite", "algo", "budget")]
+    seeds = runs["seed"].groupby([*case, [path.parents[1].name for path in paths]])
+    rank = seeds.transform("nunique") + 1000 * (runs["settings"] == "")
+    return runs[rank == rank.groupby(case).transform("max")]
 
 
 def pack(folder: Path, name: str, by_environment: bool = False) -> None:

@@ -2,24 +2,22 @@
 
 Made from the packed logs of the grand table are the overview on the page; all rows,
 ``docs/data/leaderboard.csv``; and ``rows.csv`` in ``sb3_guard/zoo/results`` for ``sb3-guard
-reproduce``. ``--train FOLDER`` trains the grand table, the grids ``docs/data/grand_table*.yml`` in
-the order of ``GRIDS``, and continues where it was stopped; ``--pack FOLDER`` packs the logs of the
-runs that are finished there into ``docs/data``.
+reproduce``. ``--train FOLDER`` trains the grand table, its grids in the order of ``GRIDS``, and
+continues where it was stopped; ``--pack FOLDER`` packs the logs of the runs that are finished there
+into ``docs/data``.
 """
 
 import argparse
 import re
 import subprocess
 import sys
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from archives import DATA, DOCS, archives, pack, unpacked
-from results import certified
+from archives import DATA, DOCS, archives, chosen, former, pack, unpacked
+from results import SEEDS, certified
 
-from sb3_guard.algorithms import TrustRegion
 from sb3_guard.reproduce import final_hash, measures
 from sb3_guard.zoo.cli.markdown import table
 from sb3_guard.zoo.results.runs import read_episodes, select
@@ -27,7 +25,6 @@ from sb3_guard.zoo.results.statistics import judge
 from sb3_guard.zoo.results.tables import number
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.folder import RunFolder
-from sb3_guard.zoo.run.hyperparams import read_hyperparams
 
 PAGE = DOCS / "leaderboard.md"
 TABLE = DATA / "leaderboard.csv"
@@ -46,16 +43,15 @@ GRIDS = (
     ("grand_table_tasks", "grand_table"),
     ("grand_table_tasks_first_order", "grand_table"),
     ("grand_table_algorithms", "grand_table"),
+    ("delivery", "delivery"),
 )
 FOLDERS = (*dict.fromkeys(folder for _, folder in GRIDS),)
 COLUMNS = [
-    "environment", "million_steps", "place", "algo", "seeds", "return", "return_std", "cost", "low",
-    "high", "verdict", "above", "excess", "most_likely_return", "most_likely_cost",
+    "environment", "million_steps", "place", "algo", "settings", "seeds", "return", "return_std",
+    "cost", "low", "high", "verdict", "above", "excess", "most_likely_return", "most_likely_cost",
     "most_likely_verdict", "delivered", "cost_total", "row",
 ]  # fmt: skip
 MARKS = {"kept": " ✓", "exceeded": " ✗"}
-MILLION = 1_000_000
-SEEDS = 3  # from which on a row that keeps its limit has a place
 
 
 def limit_of(env_id: str) -> float:
@@ -65,13 +61,10 @@ def limit_of(env_id: str) -> float:
 
 def as_then(result: dict[str, Any]) -> str:
     """The command of a run, with the settings that were the defaults when it was trained."""
-    command, algo = result["command"], result["algo"]
+    command = result["command"]
     if "delivered" in result:
         return command
-    then = ["aim:mean"] if "aim" in read_hyperparams(algo, result["env"]) else []
-    if issubclass(algorithm(algo), TrustRegion):
-        then += ["batch_size:None", "n_critic_updates:80"]
-    if then:
+    if then := former(result):
         option = " --hyperparams " if " --hyperparams " in command else " --vec-env"
         before, _, after = command.partition(option)
         after = after if option == " --hyperparams " else f"--vec-env{after}"
@@ -84,17 +77,15 @@ def read() -> tuple[pd.DataFrame, pd.DataFrame]:
     What the packed logs say.
 
     :return: the rows of the page, as :func:`~sb3_guard.zoo.results.statistics.judge` has them, with
-        ``budget`` (millions of steps), ``cost_total`` and ``row``, the first run's; and those of
-        the package, a row per run
+        ``budget`` and ``settings`` (see :func:`~archives.chosen`), ``cost_total`` and ``row``, the
+        first run's; and those of the package, a row per run
     """
+    names = [name for name in FOLDERS if archives(name)]
+    if not names:
+        return pd.DataFrame(), pd.DataFrame()
     pages, runs = [], []
-    with ExitStack() as stack:
-        names = [name for name in FOLDERS if archives(name)]
-        grids = [stack.enter_context(unpacked(name)).runs.assign(grid=name) for name in names]
-        if not grids:
-            return pd.DataFrame(), pd.DataFrame()
-        all_ = pd.concat(grids, ignore_index=True)
-        all_["cost_total"] = [read_episodes(path)["M_c"].sum() for path in all_["path"]]
+    with unpacked(*names) as found:
+        all_ = found.runs.sort_values("suite", key=_order, kind="stable")
         all_["row"] = [f"{Path(path).parents[1].name}/{Path(path).parent.name}/"
                         f"{Path(path).name}" for path in all_["path"]]  # fmt: skip
         for run in all_.to_dict("records"):
@@ -104,11 +95,13 @@ def read() -> tuple[pd.DataFrame, pd.DataFrame]:
                 kept = {"command": as_then(result), **kept}
                 kept |= {"final": final_hash(result), "seconds": round(result["seconds"])}
                 runs.append({"row": run["row"], **kept, **measures(result)})
-        all_["budget"] = (all_["steps"] / MILLION).round().clip(lower=1).astype(int)
-        for (_, budget), group in all_.groupby(["grid", "budget"], sort=False):
+        for budget, group in chosen(all_).groupby("budget"):
             own = select(group)
+            own["cost_total"] = [read_episodes(path)["M_c"].sum() for path in own["path"]]
             extra = own.groupby(["suite", "algo"]).agg(
-                cost_total=("cost_total", "mean"), row=("row", "first")
+                cost_total=("cost_total", "mean"),
+                row=("row", "first"),
+                settings=("settings", "first"),
             )
             limits = own["suite"].map(limit_of)
             judged = judge(own.assign(cost_limit=limits, limits=limits.astype(str)))
@@ -117,16 +110,22 @@ def read() -> tuple[pd.DataFrame, pd.DataFrame]:
     return pd.concat(pages), pd.DataFrame(runs)
 
 
+def _order(suites: pd.Series) -> pd.Series:
+    """Safety-Gymnasium's tasks come first."""
+    return ~suites.str.startswith("Safety")
+
+
 def leaderboard(rows: pd.DataFrame) -> pd.DataFrame:
     """
     A row for each environment, budget and algorithm, with the columns that the page explains.
 
-    Rows with a place, their limit kept with enough seeds, come first, by return.
+    Rows with a place, their limit kept with enough seeds and today's settings, come first, by
+    return.
     """
     other = rows[rows["split"] == "greedy"].set_index("row")[["return", "cost", "verdict"]]
     final = rows[rows["split"] == "stochastic"].join(other.add_prefix("most_likely_"), on="row")
     final["kept"] = final["verdict"] == "kept"
-    final["placed"] = final["kept"] & (final["seeds"] >= SEEDS)
+    final["placed"] = final["kept"] & (final["seeds"] >= SEEDS) & (final["settings"] == "")
     order = ["placed", "kept", "return"]
     final = final.sort_values(order, ascending=False, kind="stable")
     suites = {suite: n for n, suite in enumerate(dict.fromkeys(rows["suite"]))}
@@ -150,19 +149,19 @@ def label_of(algo: str) -> str:
 
 
 def glance(rows: pd.DataFrame) -> str:
-    """For each budget and family of tasks, a row per algorithm and a column per task."""
+    """For each budget, tasks and age of settings, a row per algorithm and a column per task."""
     if not len(rows):
         return ""
-    # Of several rows of an algorithm, that with most seeds.
-    final = rows[rows["split"] == "stochastic"].reset_index(drop=True)
-    most = final.sort_values("seeds", ascending=False, kind="stable")
-    final = most.drop_duplicates(["suite", "algo", "budget"]).sort_index()
+    final = rows[rows["split"] == "stochastic"]
     parts = []
-    for (budget, _), group in final.groupby(["budget", ~final["suite"].str.startswith("Safety")]):
+    for (then, budget, _), group in final.groupby(
+        [final["settings"] != "", final["budget"], _order(final["suite"])]
+    ):
+        heading = f"{budget}e6 steps{', former settings' * then}"
         cells = {(row["algo"], row["suite"]): _at_a_glance(row) for row in group.to_dict("records")}
         tasks = {task: re.sub(r"Safety|_8Hazards|-v\d", "", task) for task in group["suite"]}
         lines = [
-            {f"{budget}e6 steps": label_of(algo)}
+            {heading: label_of(algo)}
             | {short: cells.get((algo, task), "") for task, short in tasks.items()}
             for algo in dict.fromkeys(group["algo"])
         ]
@@ -174,7 +173,8 @@ def _at_a_glance(row: dict[str, Any]) -> str:
     """A cell: return, cost, verdict and seeds."""
     digits = 0 if abs(row["return"]) >= 100 else 1
     values = f"{number(row['return'], digits)} / {number(row['cost'], 1)}"
-    return f"{values}{MARKS.get(row['verdict'], '')} ({row['seeds']})"
+    mark = MARKS.get(row["verdict"], "") if row["seeds"] >= SEEDS else ""
+    return f"{values}{mark} ({row['seeds']})"
 
 
 def page(rows: pd.DataFrame) -> str:

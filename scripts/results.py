@@ -23,6 +23,7 @@ import argparse
 import re
 import tarfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 import pandas as pd
-from archives import DATA, DOCS, pack, unpacked
+from archives import DATA, DOCS, chosen, pack, unpacked
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
@@ -58,6 +59,7 @@ BLOCK = re.compile(
 # A figure of a packed grid: file, grid and kind
 IMAGE = re.compile(r"images/((\w+?)_(pareto)_[\w-]+\.png)")
 PUBLISHED_STEPS = 1_000_000
+SEEDS = 3  # from which on an algorithm can be said to keep its limit
 LAST = 90  # episodes: three rollouts of 30 environments
 APART = 3.0  # standard errors: what counts as learnt
 
@@ -111,13 +113,24 @@ def last(runs: pd.DataFrame) -> pd.DataFrame:
     return runs.assign(**pd.DataFrame(rows, index=runs.index, dtype=float))
 
 
+@contextmanager
+def logs(name: str) -> Iterator[pd.DataFrame]:
+    """The runs of a packed grid; the grand table's with today's settings, with the deliveries'."""
+    names = ("grand_table", "delivery") if name == "grand_table" else (name,)
+    with unpacked(*names) as found:
+        assert not found.left_out, found.left_out
+        rows = found.runs
+        if name == "grand_table":
+            rows = chosen(rows).query("settings == ''").reset_index(drop=True)
+        yield rows
+
+
 @cache
 def runs(name: str) -> pd.DataFrame:
-    """The runs of a packed grid, with what is asked about their safety."""
-    with unpacked(name) as found:
-        assert not found.left_out, found.left_out
-        ends = [read_episodes(path).tail(LAST) for path in found.runs["path"]]
-        for path, steps in zip(found.runs["path"], found.runs["steps"], strict=True):
+    """The runs of :func:`logs`, with what is asked about their safety."""
+    with logs(name) as rows:
+        ends = [read_episodes(path).tail(LAST) for path in rows["path"]]
+        for path, steps in zip(rows["path"], rows["steps"], strict=True):
             log = pd.read_csv(Path(path, "progress.csv"))["time/total_timesteps"]
             # The steps after the last line are fewer than those between two lines.
             assert log.iloc[-1] + max(log.iloc[0], log.diff().max()) >= steps, (
@@ -125,7 +138,7 @@ def runs(name: str) -> pd.DataFrame:
             )
         returns = pd.DataFrame([end["J_r"] for end in ends]).T
         means = {"trained": [*returns.mean()], "trained_se": [*returns.sem()]}
-        return last(found.runs).assign(**means)
+        return last(rows).assign(**means)
 
 
 def tables(name: str, only: str | None) -> str:
@@ -308,16 +321,20 @@ def best(name: str) -> str:
     A row per environment: the highest return of an agent within the limit.
 
     Of the runs of a grid what was certified counts, if half of them deliver, of the leaderboard's
-    rows the final policy with sampled actions. Where nothing is within the limit, an undecided one
-    stands there, else the lowest cost. Minutes are those of the leaderboard's runs, the median over
-    seeds.
+    rows with today's settings the final policy with sampled actions; both need three seeds. Where
+    nothing is within the limit, an undecided one stands there, else the lowest cost. Minutes are
+    the median over seeds.
     """
     board, runs = pd.read_csv(DATA / "leaderboard.csv"), pd.read_csv(ROWS)
     took = (runs["seconds"] / 60).groupby(runs["row"].str.rsplit("_", n=1).str[0]).median()
+    board = board[board["settings"].isna()].copy()
+    few = (board["verdict"] == "kept") & (board["seeds"] < SEEDS)
+    board["verdict"] = board["verdict"].mask(few, "undecided")
     board["minutes"] = board["row"].str.rsplit("_", n=1).str[0].map(took)
     found = certified(name).rename(columns={"suite": "environment", "mean": "cost"})
     found = found.assign(verdict="certified", million_steps=1, seeds=found["delivered"])
-    half = [2 * int(some) >= int(all_) for some, all_ in found["delivered"].str.split(" of ")]
+    counts = [map(int, text.split(" of ")) for text in found["delivered"]]
+    half = [2 * some >= all_ >= SEEDS for some, all_ in counts]
     found = found[half].merge(
         board.loc[board["million_steps"] == 1, ["environment", "algo", "minutes"]], how="left"
     )
@@ -447,8 +464,8 @@ def figures(text: str) -> Iterator[tuple[str, Figure]]:
     """The figures of packed grids that a page names, with their files' names."""
     images = IMAGE.findall(text)
     for name, kind in sorted({(name, kind) for _, name, kind in images}):
-        with unpacked(name) as found:
-            runs = last(found.runs)
+        with logs(name) as rows:
+            runs = last(rows)
             # Drawn is what the tables have: the last ten epochs, not the last one.
             means = {"J_r": runs["return_last"], "M_c": runs["cost_last"]}
             drawings = draw(kind, Data(runs.assign(**means)))

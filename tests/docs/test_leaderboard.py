@@ -34,47 +34,71 @@ def scripts(monkeypatch, tmp_path):
         sys.modules.pop(name)
 
 
-def test_certified_rows_come_first_by_return(scripts, tmp_path, monkeypatch):
+def test_rows_that_keep_the_limit_come_first_by_return(scripts, tmp_path, monkeypatch):
     board, archives = scripts
-    one = {"suite": "SafetyPointGoal1-v0", "algo": "cpo", "delivered": "1 of 3"}
+    one = {"suite": "SafetyPointGoal1-v0", "algo": "cup", "delivered": "1 of 3"}
     monkeypatch.setattr(board, "certified", lambda name: pd.DataFrame([one]))
     for algo, mean, cost, seeds in (
-        ("cpo", 10.0, 20.0, 3), ("pcpo", 12.0, 24.0, 3), ("p3o", 15.0, 24.0, 2),
-        ("trpo_lag", 20.0, 30.0, 2),
+        ("cup", 10.0, 20.0, 3), ("focops", 12.0, 24.0, 3), ("p3o", 15.0, 24.0, 2),
+        ("cppo_pid", 20.0, 30.0, 3), ("sac_lag", 5.0, 30.0, 2),
     ):  # fmt: skip
         played_by(tmp_path / "logs", algo, mean, cost, seeds)
     archives.pack(tmp_path / "logs", "grand_table", by_environment=True)
     rows, runs = board.read()
-    assert len(runs) == 10 and "grand_table/cpo/SafetyPointGoal1-v0_1" in {*runs["row"]}
+    assert len(runs) == 13 and "grand_table/cup/SafetyPointGoal1-v0_1" in {*runs["row"]}
     glance = [" ".join(line.split()) for line in board.glance(rows).splitlines()]
     assert glance[0] == "| 1e6 steps | PointGoal1 |"
-    assert {"| PCPO | 12.0 / 24.0 ✓ (3) |", "| TRPO-Lagrangian | 20.0 / 30.0 ✗ (2) |"} < {*glance}
+    assert {"| FOCOPS | 12.0 / 24.0 ✓ (3) |", "| CPPO-PID | 20.0 / 30.0 ✗ (3) |"} < {*glance}
+    # Two seeds are too few for a mark and a place.
+    assert {"| P3O | 15.0 / 24.0 (2) |", "| SAC-Lagrangian | 5.0 / 30.0 (2) |"} < {*glance}
     table = board.leaderboard(rows)
-    # Two seeds are too few for a place.
     assert table[["algo", "seeds", "verdict"]].values.tolist() == [
-        ["pcpo", 3, "kept"], ["cpo", 3, "kept"], ["p3o", 2, "kept"],
-        ["trpo_lag", 2, "exceeded"],
+        ["focops", 3, "kept"], ["cup", 3, "kept"], ["p3o", 2, "kept"],
+        ["cppo_pid", 3, "exceeded"], ["sac_lag", 2, "exceeded"],
     ]  # fmt: skip
     assert table["place"].dropna().tolist() == [1, 2]
     assert table["delivered"].dropna().to_dict() == {1: "1 of 3"}
-    first, last = table.iloc[0], table.iloc[-1]
-    assert first["row"] == "grand_table/pcpo/SafetyPointGoal1-v0_1"
+    first, last = table.iloc[0], table.iloc[3]
+    assert first["row"] == "grand_table/focops/SafetyPointGoal1-v0_1"
     assert (first["cost"], first["low"], first["high"]) == (24.0, 24.0, 24.0)
     assert (last["above"], last["excess"]) == (1.0, 0.2)
     assert board.glance(rows.iloc[:0]) == ""
 
 
+def test_rows_of_former_defaults_stand_apart_and_give_way_to_those_of_today(scripts, tmp_path):
+    board, archives = scripts
+    for algo in ("pcpo", "cpo", "sac_lag"):
+        played_by(tmp_path / "then", algo, 10.0, 20.0, 1)
+    for algo in ("cpo", "sac_lag"):
+        played_by(tmp_path / "now", algo, 9.0, 19.0, 3, delivered=None)
+    archives.pack(tmp_path / "then", "grand_table")
+    archives.pack(tmp_path / "now", "delivery")
+    rows, runs = board.read()
+    table = board.leaderboard(rows).set_index("algo")
+    assert table["return"].to_dict() == {"cpo": 9.0, "sac_lag": 9.0, "pcpo": 10.0}
+    assert table["settings"].to_dict() == {
+        "cpo": "", "sac_lag": "", "pcpo": "batch_size:None n_critic_updates:80",
+    }  # fmt: skip
+    now, then = board.glance(rows).split("\n\n")
+    assert "PCPO" not in now and then.startswith("| 1e6 steps, former settings | PointGoal1 ")
+    assert "| PCPO " in then and "SAC" not in then
+    assert len(runs) == 9  # can all be trained again
+    with sys.modules["results"].logs("grand_table") as kept:
+        assert kept["algo"].value_counts().to_dict() == {"cpo": 3, "sac_lag": 3}
+
+
 @pytest.mark.usefixtures("scripts")
 def test_the_best_agent_of_each_environment_stands_first(tmp_path, monkeypatch):
     results = sys.modules["results"]
-    header = "environment,million_steps,algo,seeds,return,cost,verdict,row"
+    header = "environment,million_steps,algo,settings,seeds,return,cost,verdict,row"
     lines = [
-        "SafetyA-v0,1,cpo,3,9.0,20.0,kept,g/cpo/SafetyA-v0_1",
-        "SafetyA-v0,1,trpo,3,20.0,60.0,exceeded,g/trpo/SafetyA-v0_1",
-        "SafetyB-v0,1,cpo,1,5.0,24.0,undecided,g/cpo/SafetyB-v0_1",
-        "SafetyB-v0,1,pcpo,1,4.0,20.0,undecided,g/pcpo/SafetyB-v0_1",
-        "Goal_C,2,cpo,1,5.0,9.0,exceeded,g/cpo/Goal_C_1",
-        "Goal_C,1,trpo,1,9.0,10.0,exceeded,g/trpo/Goal_C_1",
+        "SafetyA-v0,1,cpo,,3,9.0,20.0,kept,g/cpo/SafetyA-v0_1",
+        "SafetyA-v0,1,trpo,,3,20.0,60.0,exceeded,g/trpo/SafetyA-v0_1",
+        "SafetyB-v0,1,cpo,,1,5.0,24.0,kept,g/cpo/SafetyB-v0_1",  # of one seed: undecided
+        "SafetyB-v0,1,pcpo,,1,4.0,20.0,undecided,g/pcpo/SafetyB-v0_1",
+        "Goal_C,2,cpo,,1,5.0,9.0,exceeded,g/cpo/Goal_C_1",
+        "Goal_C,1,trpo,,1,9.0,10.0,exceeded,g/trpo/Goal_C_1",
+        "Goal_C,1,pcpo,aim:mean,3,20.0,1.0,kept,g/pcpo/Goal_C_1",  # of former defaults
     ]
     (tmp_path / "data" / "leaderboard.csv").write_text("\n".join([header, *lines]))
     runs = tmp_path / "rows.csv"
@@ -85,6 +109,7 @@ def test_the_best_agent_of_each_environment_stands_first(tmp_path, monkeypatch):
     given = [
         ["SafetyA-v0", "trpo", "2 of 3", 12.0, 19.5],
         ["SafetyB-v0", "cpo", "1 of 3", 1.0, 2.0],  # less than half
+        ["SafetyB-v0", "p3o", "2 of 2", 9.0, 2.0],  # too few
     ]
     monkeypatch.setattr(results, "certified", lambda name: pd.DataFrame(given, columns=columns))
     _, _, *rows = results.best("x").splitlines()
@@ -95,10 +120,13 @@ def test_the_best_agent_of_each_environment_stands_first(tmp_path, monkeypatch):
     ]
 
 
-def played_by(folder: Path, algo: str, mean: float, cost: float, seeds: int) -> None:
+def played_by(
+    folder: Path, algo: str, mean: float, cost: float, seeds: int, **result: object
+) -> None:
     """Runs on SafetyPointGoal1 whose final episodes all have the same return and cost."""
     played = {"returns": [mean] * 4, "costs": [cost] * 4, "lengths": [1000] * 4}
     made = {"command": "sb3-guard train", "curve": "12", "seconds": 9.0, "n_timesteps": 1_000_000}
+    made |= result
     for seed in range(seeds):
         fake_run(folder, algo, "SafetyPointGoal1-v0", seed, config={"cost_limit": 25.0},
                  final={"stochastic": played, "greedy": played},

@@ -136,6 +136,9 @@ def test_the_cost_axis_ends_near_the_limit(tmp_path):
         (drawing,) = draw(kind, read(tmp_path)).values()
         axes = [axis for axis in drawing.axes if "cost" in getattr(axis, f"get_{way}label")()]
         assert getattr(axes[0], f"get_{way}lim")() == (0, 25)
+        (beyond,) = axes[0].texts  # an arrow to the edge, with the number
+        place = dict(zip("xy", beyond.xy, strict=True))
+        assert beyond.get_text() == "1,000" and place[way] == 25
 
 
 # What is missing

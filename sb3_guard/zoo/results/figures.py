@@ -19,7 +19,7 @@ from sb3_guard.zoo.grids.presets import GHOSTS, HAZARDS, MAIN8, OPTIONS, RADAR4,
 from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
 from sb3_guard.zoo.results.runs import REFERENCE
 from sb3_guard.zoo.results.statistics import SCORES, mean_curve
-from sb3_guard.zoo.results.tables import HEADINGS, SCORE_HEADINGS, written
+from sb3_guard.zoo.results.tables import HEADINGS, SCORE_HEADINGS, number, written
 
 FORMATS = ("png", "svg", "pdf")
 WIDTH = 8.0  # inches: at the width of a page, text has the size of the page's
@@ -59,6 +59,20 @@ def fit_costs(axis: Axes, limit: float, way: str = "y") -> None:
     getattr(axis, f"set_{way}lim")(1.1 * min(lowest, 0.0), end)
 
 
+def mark_beyond(axis: Axes, value: float, other: float, color: str, way: str = "y") -> None:
+    """Draw an arrow at the end of a cost axis, with the number of a mean that lies beyond it."""
+    end, before = getattr(axis, f"get_{way}lim")()[1], len(axis.texts)
+    if value <= end:
+        return
+    # Neighbours stand above and below, or side by side.
+    place, text = ((end, other), (-22, 0)) if way == "x" else ((other, end), (-26 * before, -22))
+    axis.annotate(
+        number(value, int(value < 10)), place, text, textcoords="offset points", color=color,
+        fontsize=8, ha="right", va="bottom" if way == "x" and before % 2 else "top",
+        arrowprops={"arrowstyle": "->", "color": color, "shrinkA": 0, "shrinkB": 0},
+    )  # fmt: skip
+
+
 def name_of(column: str) -> str:
     """What an axis calls a column."""
     return HEADINGS.get(column, f"episode cost, {column[4:]}")
@@ -77,6 +91,7 @@ def draw_limit(line: Callable[..., Any], data: Data, suite: str, cost: str) -> f
 
 def draw_curves(axis: Axes, data: Data, suite: str, metric: str) -> None:
     """Draw one figure of merit against steps: means of the seeds, shaded ± their deviation."""
+    ends = []
     for algo in data.algos(suite):
         curves = [curve for curve in data.curves(suite, algo) if metric in curve]
         if not curves:
@@ -84,6 +99,7 @@ def draw_curves(axis: Axes, data: Data, suite: str, metric: str) -> None:
         table, look = mean_curve(curves, metric), data.looks[algo]
         steps = table.index.to_numpy()
         axis.plot(steps, table["mean"], linewidth=1.5, **look.line)
+        ends.append((steps[-1], table["mean"].iloc[-1], look.color))
         if len(curves) > 1:
             low, high = table["mean"] - table["std"], table["mean"] + table["std"]
             axis.fill_between(steps, low, high, color=look.color, alpha=0.15, linewidth=0)
@@ -92,6 +108,8 @@ def draw_curves(axis: Axes, data: Data, suite: str, metric: str) -> None:
     axis.set_xlim(left=0)
     if metric.startswith("M_c"):
         fit_costs(axis, draw_limit(axis.axhline, data, suite, metric))
+        for steps, value, color in ends:
+            mark_beyond(axis, value, steps, color)
 
 
 def draw_pareto(axis: Axes, data: Data, suite: str, cost: str = "M_c") -> None:
@@ -109,6 +127,8 @@ def draw_pareto(axis: Axes, data: Data, suite: str, cost: str = "M_c") -> None:
     axis.set(xlabel=name_of(cost), ylabel="return", title=title_of(data, suite))
     axis.margins(0.08)
     fit_costs(axis, limit, "x")
+    for row in means.to_dict("records"):
+        mark_beyond(axis, row[cost], row["J_r"], data.looks[row["algo"]].color, "x")
     if not np.isnan(limit) and limit < (end := axis.get_xlim()[1]):
         axis.axvspan(limit, end, color=INK, alpha=0.1, linewidth=0, label="above the limit")
 

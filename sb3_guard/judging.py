@@ -206,6 +206,14 @@ class Bound:
             return "certified"
         return "exceeded" if self.lower > self.limit else "undecided"
 
+    def __str__(self) -> str:
+        deciding = {
+            "certified": f"upper bound {self.upper:.4g}",
+            "exceeded": f"lower bound {self.lower:.4g}",
+            "undecided": f"bounds {self.lower:.4g} and {self.upper:.4g}",
+        }[self.verdict]
+        return f"{self.mean:.4g}, {deciding}, limit {self.limit:g}"
+
     def episodes_to_decide(self, error: float, most: float | None) -> float:
         """How many episodes would probably decide, if mean and deviation stay."""
         gap = abs(self.limit - self.mean)

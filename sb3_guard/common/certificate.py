@@ -96,16 +96,8 @@ class Certificate(Judgement):
                 f"0, limit {bound.limit:g}; no cost in {self.episodes} fresh episodes, an event in "
                 f"up to 1 of {one_of} would not have been seen"
             )
-        deciding = {
-            "certified": f"upper bound {bound.upper:.4g}",
-            "exceeded": f"lower bound {bound.lower:.4g}",
-            "undecided": f"bounds {bound.lower:.4g} and {bound.upper:.4g}",
-        }[bound.verdict]
-        return (
-            f"{bound.mean:.4g}, {deciding}, limit {bound.limit:g}; "
-            f"{round(bound.share_above * self.episodes)} of {self.episodes} fresh episodes cost "
-            "more than the limit"
-        )
+        above = round(bound.share_above * self.episodes)
+        return f"{bound}; {above} of {self.episodes} fresh episodes cost more than the limit"
 
     def foreign(self, model: Any, env: VecEnv, deterministic: bool) -> str:
         """

@@ -1,6 +1,7 @@
 """The agents that come with the package: shipped, loaded, played, listed and filmed."""
 
 import json
+import re
 import runpy
 import shutil
 from dataclasses import replace
@@ -190,3 +191,4 @@ def test_the_pretrained_agents_are_listed(command, capsys):
     assert [(row[0], row[1]) for row in cells] == [
         (run.name, run.path.parent.name) for run in SHIPPED
     ]
+    assert all(re.search(r" bound [\d.]+, limit \d+$", row[5]) for row in cells)

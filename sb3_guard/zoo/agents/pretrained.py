@@ -109,7 +109,9 @@ def listed() -> str:
         trained_at = "–" if limit is None else f"{limit:g}"
         cells = [run.name, run.path.parent.name, f"{result['n_timesteps']:,}", trained_at]
         for certificate in certificates(run).values():
-            cost, _, _ = str(certificate.nearest).partition(";")
-            cells += [f"{certificate.mean_return:.1f}", f"{certificate.verdict}: {cost}"]
+            cells += [
+                f"{certificate.mean_return:.1f}",
+                f"{certificate.verdict}: {certificate.nearest}",
+            ]
         rows.append(cells)
     return table(header, rows)

@@ -10,9 +10,11 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import RolloutReturn
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.algorithms.common.arguments import hyperparameter
@@ -88,10 +90,20 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
 
     replay_buffer: CostReplayBuffer | CostDictReplayBuffer
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
+    def __init__(
+        self, policy: str | type[BasePolicy], env: GymEnv | str, *args: Any, **kwargs: Any
+    ) -> None:
+        if isinstance(env, str):  # made here already, to look at its actions
+            env = maybe_make_env(env, kwargs.get("verbose", 0))
+        space = getattr(env, "single_action_space", None) or getattr(env, "action_space", None)
+        if space is not None and not isinstance(space, spaces.Box):
+            raise ValueError(
+                f"{type(self).__name__} needs continuous actions (Box), not {space}: for others "
+                "there are on-policy algorithms such as PPOLag"
+            )
         self.cost_deviation = np.zeros(0, np.float32)  # of Q_C in the last batch, shape (m,)
         self.latest_costs: list[np.ndarray] = []  # of the last episodes, each of shape (m,)
-        super().__init__(*args, **kwargs)
+        super().__init__(policy, env, *args, **kwargs)
 
     # Construction and saving
 

@@ -6,16 +6,18 @@ hub's own command uploads it (``hf upload me/my_agent agent``) and downloads it.
 
 import shutil
 import sys
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
-from sb3_guard.common.certificate import Certificate
 from sb3_guard.judging import Mean
+from sb3_guard.zoo.agents.flags import AgentFlags
+from sb3_guard.zoo.agents.playback import open_agent
 from sb3_guard.zoo.cli.flags import Command, command, flag
-from sb3_guard.zoo.cli.usage import UsageError, explained, packages_flag
+from sb3_guard.zoo.cli.usage import UsageError, packages_flag
 from sb3_guard.zoo.run.folder import PLAYED, RunFolder
 from sb3_guard.zoo.run.progress import summary
 
@@ -106,11 +108,10 @@ def hub(flags: Flags) -> int:
     if (file := run.path / "certificate.json").is_file():
         if not (run.path / "certified_model.zip").is_file():
             raise UsageError(f"{file} is of no certified_model.zip: move it elsewhere")
-        with explained(f"{file} is damaged"):
-            certificate = Certificate.from_json(file.read_text())
-        if certificate.env["id"] != trained.env:
-            raise UsageError(f"{file} is of another environment, {certificate.env['id']}")
-        figures.append(str(certificate))
+        named = {"folder": str(run.path), "gym_packages": trained.gym_packages}
+        agent = open_agent(AgentFlags.of(named), None)
+        with closing(agent.env):
+            figures.append(agent.certified)
     empty(folder)
     RunFolder.create(trained, hyperparams, trained.command(), folder)
     for path in files:

@@ -110,10 +110,11 @@ class Certificate(Judgement):
         :param deterministic: whether its most likely actions are taken
         :return: such as ``"another environment"``; empty if it is of this agent in this world
         """
-        if self.agent != agent_hash(model, env):
+        # Agents without weights and environments without an id are not told apart.
+        if not self.agent or self.agent != agent_hash(model, env):
             return "another agent"
         names = Limits.of(model, cost_keys_of(model, env)).names
-        if self.env != described(env) or tuple(self.costs) != names:
+        if not self.env.get("id") or self.env != described(env) or tuple(self.costs) != names:
             return "another environment"
         return "" if self.deterministic == deterministic else f"{self._actions} actions"
 

@@ -385,6 +385,8 @@ class _Tally:
         self.absent = {*keys}  # costs that no step has reported
         self.different: set[tuple[Any, ...]] = set()  # episodes, as far as they differ
         self.copies = True
+        #: whether all environments began alike whenever they began together, and how they began
+        self.alike, self.starts = env.num_envs > 1, set[int]()
 
     def begin(self, observations: Any) -> None:
         """An episode begins in every environment; those that are asked for count."""
@@ -396,6 +398,8 @@ class _Tally:
         self.first, self.over = _prints(observations), list[tuple[float, int, EpisodeCost]]()
         if n > 1:
             self.different = set()
+        self.alike &= len({*self.first}) == 1
+        self.starts.add(self.first[0])
 
     def end(self) -> None:
         """All episodes that began together have ended, or steps are used up."""
@@ -492,5 +496,7 @@ class _Tally:
             successes=np.array(self.successes, dtype=bool),
             unfinished=np.concatenate(self.unfinished),
             absent=tuple(key for key in self.keys if key in self.absent),
-            copies=self.copies and len(self.ended) > 1,
+            # With sampled actions copies differ, but for their first observations.
+            copies=len(self.ended) > 1
+            and (self.copies or (self.alike and len(self.starts) > 1)),
         )

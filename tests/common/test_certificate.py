@@ -116,6 +116,33 @@ def test_copies_of_one_episode_are_refused(n_envs):
         certify(Idle(), DummyVecEnv([Copies] * n_envs), 3.0)
 
 
+class OwnWorlds(Lottery):
+    """Each row draws its worlds from a generator of its own, which is seeded alike in all rows."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.worlds = np.random.default_rng(0)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.worlds.random(1, np.float32), {}
+
+
+def test_copies_of_one_world_are_refused_though_the_episodes_in_it_differ():
+    with pytest.raises(ValueError, match="copies of one episode"):
+        certify(Idle(), DummyVecEnv([OwnWorlds] * 20), 3.0)
+    assert certify(Idle(), DummyVecEnv([OwnWorlds]), 3.0).verdict == "certified"
+
+
+def test_an_environment_without_an_id_is_no_ones():
+    env = DummyVecEnv([Lottery])
+    model = agent(env)
+    certificate = certify(model, env, 3.0, n_episodes=100, seed=1)
+    assert certificate.foreign(model, env, True) == "another environment"
+    assert certificate.foreign(Idle(), env, True) == "another agent"
+    assert certify(Idle(), env, 3.0).foreign(Idle(), env, True) == "another agent"
+
+
 def agent(env, **kwargs):
     return PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu", **kwargs)
 

@@ -148,6 +148,17 @@ def test_how_many_episodes_would_decide():
     assert width == pytest.approx(abs(1.0 - seen.mean()), rel=0.01) or seen.mean() > 1.0
 
 
+def test_only_undecided_costs_ask_for_more_episodes():
+    """A constant cost at its limit is certified, and no number of episodes would change that."""
+    costs = np.stack([np.ones(4 * EPISODES), exponential(0.9, seed=4)], axis=1)
+    assert decide(limits(1.0, 1.0), player(costs)).episodes == 2 * EPISODES
+
+
+def test_where_bounds_are_exact_up_to_four_times_as_many_are_played():
+    judgement = decide(limits(1.0), player(np.full(4 * EPISODES, 0.995)), most=2.0)
+    assert judgement.verdict == "certified" and judgement.episodes > 2 * EPISODES
+
+
 def test_looks_and_tries_share_the_error(monkeypatch):
     shares: dict[str, list[float]] = {"upper": [], "lower": []}
 
@@ -173,6 +184,8 @@ def test_of_several_tries_one_above_its_limit_is_left():
     costs = exponential(1.1, seed=3)
     assert decide(limits(1.0), player(costs)).episodes > 100
     assert decide(limits(1.0), player(costs), tries=3).episodes == 100
+    both = np.stack([costs, exponential(0.1)], axis=1)
+    assert decide(limits(1.0, 1.0), player(both), tries=3).episodes == 100
 
 
 def test_all_costs_must_be_within_their_limits():
@@ -253,6 +266,11 @@ def test_the_excess_by_hand():
     assert limits(6.0).excess(costs[:1]) == pytest.approx([-2.0])
     assert np.isinf(limits(6.0).excess(costs[:0])).all()
     assert np.isnan(limits(6.0).excess(np.array([[1.0], [np.nan]]))).all()
+
+
+def test_models_are_chosen_by_a_cost_of_1_in_place_of_a_limit_of_0():
+    assert limits(0.0, 2.0).to_choose().values.tolist() == [1.0, 2.0]
+    assert limits(0.0, 2.0).to_choose(0.0).values.tolist() == [0.0, 0.0]
 
 
 def test_an_agent_that_aims_below_its_limit_by_the_half_width_is_certified():

@@ -7,7 +7,7 @@ import pytest
 import yaml
 from typed import PLAY, refused, trained
 
-from sb3_guard import enjoy, hub, train
+from sb3_guard import certify_agent, enjoy, hub, train
 from sb3_guard.zoo.agents.flags import EnjoyFlags
 
 
@@ -149,6 +149,22 @@ def test_a_certificate_without_its_model_is_not_shown(run, tmp_path, capsys):
     )
     assert enjoy.main([*PLAY, "-f", str(copied), "--n-episodes", "1"]) == 0
     assert f"Playing {copied / 'Filmed-v0.zip'}" in capsys.readouterr().out
+
+
+def test_the_card_shows_the_certificate_of_this_very_agent_alone(run, tmp_path):
+    copied = tmp_path / "run"
+    shutil.copytree(run, copied)
+    shutil.copy(copied / "Filmed-v0.zip", copied / "certified_model.zip")
+    statistics = copied / "certified_model_vecnormalize.pkl"
+    shutil.copy(copied / "Filmed-v0" / "vecnormalize.pkl", statistics)
+    pages = []
+    for number, more in enumerate(([], ["--env-kwargs", "max_episode_steps:3"])):
+        file = str(copied / "certificate.json")
+        asked = ["--cost-limit", "1000", "--n-episodes", "100", "--json", file]
+        assert certify_agent.main(["-f", str(copied), *PLAY[:4], *asked, *more]) == 0
+        pages.append(staged(copied, tmp_path / f"agent{number}"))
+    assert "certified: mean cost " in pages[0]
+    assert "certified: " not in pages[1] and "certificate is of another environment" in pages[1]
 
 
 def test_a_run_is_not_written_into_its_own_folder(run, capsys):

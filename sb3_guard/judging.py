@@ -393,15 +393,17 @@ def decide(
             f"most={most:g}: limits must be above 0 and at most that, not {d.tolist()}"
         )
     looks = LOOKS if most is None else {k / 6: 1.0 for k in range(1, 25)}
-    costs = np.zeros((0, len(d)))
+    costs, order = np.zeros((0, len(d))), np.zeros(0)
     for factor, share in looks.items():
-        costs = np.concatenate([costs, play(math.ceil(factor * n_episodes) - len(costs))])
+        further = play(math.ceil(factor * n_episodes) - len(costs))
+        costs = np.concatenate([costs, further])
+        order = np.concatenate([order, np.arange(len(further)) % (rows or 1)])
         # Only one cost must exceed its limit, but all must keep theirs: an agent that exceeds one
         # is certified no more often than by this one.
         lower, upper = error / len(d), error / tries * (share or LOOKS[1.0])
         if most is None:
             lower /= len(looks)
-        judgement = _look(limits, costs, (lower, upper), most, rows)
+        judgement = _look(limits, costs, (lower, upper), most, order if rows else None)
         hopeless = tries > 1 and any(cost.mean > cost.limit for cost in judgement.costs.values())
         if judgement.verdict == "certified" and not share:
             continue
@@ -417,7 +419,7 @@ def _look(
     costs: np.ndarray,
     errors: tuple[float, float],
     most: float | None,
-    rows: int | None,
+    rows: np.ndarray | None,
 ) -> Judgement:
     """The judgement after the episodes so far, whose costs have shape [E, m]."""
     ended = costs[~np.isnan(costs).any(axis=1)]
@@ -445,19 +447,24 @@ def _look(
     return Judgement(verdict, named, n, physics_errors, reason, to_decide)
 
 
-def _correlation(costs: np.ndarray, rows: int | None) -> float:
+def _correlation(costs: np.ndarray, rows: np.ndarray | None) -> float:
     """
     The highest correlation between an episode's cost and that of the next one in its environment.
 
-    :param costs: shape [E, m], environments in turns
+    :param costs: shape [E, m]
+    :param rows: the environment of each episode, shape [E]
     :return: 0 where it is not higher than independent episodes' would be
     """
-    if rows is None or len(costs) - rows < 30:
+    if rows is None:
         return 0.0
-    deviations = np.nan_to_num(costs - np.nanmean(costs, axis=0))
-    square = np.maximum((deviations**2).sum(axis=0), np.finfo(float).tiny)
-    value = float(((deviations[:-rows] * deviations[rows:]).sum(axis=0) / square).max())
-    return value if value > 3.0 / math.sqrt(len(costs) - rows) else 0.0
+    order = np.argsort(rows, kind="stable")
+    first = np.flatnonzero(np.diff(rows[order]) == 0)  # of two that follow each other
+    if len(first) < 30:
+        return 0.0
+    deviations = np.nan_to_num(costs - np.nanmean(costs, axis=0))[order]
+    square = np.maximum((deviations**2).mean(axis=0), np.finfo(float).tiny)
+    value = float(((deviations[first] * deviations[first + 1]).mean(axis=0) / square).max())
+    return value if value > 3.0 / math.sqrt(len(first)) else 0.0
 
 
 def kept(low: float, high: float, limit: float, diverged: int = 0) -> str:

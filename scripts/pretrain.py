@@ -27,7 +27,7 @@ from archives import with_log_folder
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_guard import Certificate, certify
-from sb3_guard.common.certificate import TRAINING_ONLY
+from sb3_guard.common.certificate import LEFT_OUT
 from sb3_guard.judging import TRIES, Limits
 from sb3_guard.zoo.agents.pretrained import (
     PLAYED,
@@ -161,7 +161,7 @@ def write(run: RunFolder, limit: float | None, got: dict[str, Certificate]) -> R
     (path / run.name / "args.yml").write_bytes(with_log_folder(run.params / "args.yml", "logs"))
     copy = RunFolder(path)
     policy = original.policy.state_dict()
-    left_out = tuple(f"{part}." for part in TRAINING_ONLY)
+    left_out = tuple(f"{part}." for part in LEFT_OUT)
     acting = {n: t.clone() for n, t in policy.items() if not n.startswith(left_out)}
     saved: dict[str, Any] = {"policy": acting}
     if (normalizer := original.get_vec_normalize_env()) is not None:

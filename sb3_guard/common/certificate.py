@@ -31,10 +31,11 @@ from sb3_guard.vector import (
 PACKAGES = "sb3-guard", "stable-baselines3", "torch", "mujoco"
 # Arguments of an environment that change its pictures alone
 DRAWN = {"render_mode", "width", "height", "camera_name", "camera_id"}
-#: Parts of a policy that it acts without: critics and targets.
-TRAINING_ONLY = (
+#: Parts of a policy that its hash leaves out: critics and targets, without which it acts, and the
+#: bounds of actions, which are those of the environment.
+LEFT_OUT = (
     "value_net", "mlp_extractor.value_net", "vf_features_extractor", "critic", "critic_target",
-    "actor_target",
+    "actor_target", "box",
 )  # fmt: skip
 
 
@@ -168,7 +169,7 @@ def agent_hash(model: Any, env: VecEnv) -> str:
         return ""
 
     def acts(name: str) -> bool:
-        return not any(f"{name}.".startswith(f"{part}.") for part in TRAINING_ONLY)
+        return not any(f"{name}.".startswith(f"{part}.") for part in LEFT_OUT)
 
     digest.update(type(policy).__name__.encode())
     for name, module in policy.named_modules():

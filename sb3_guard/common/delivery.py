@@ -266,12 +266,7 @@ class DeliveryCallback(CostEvalCallback):
 
     @staticmethod
     def _tries(contents: Sequence[dict[str, Any]], limits: Limits) -> Iterator[Candidate]:
-        """
-        Candidates in the order in which they are tried.
-
-        First the one of highest return whose mean cost plus its standard error is within the limit;
-        after a refusal plus twice that, then three times. If none is, the nearest.
-        """
+        """Candidates in the order in which they are tried, each with more caution."""
         left = [candidate for content in contents for candidate in _played(content)]
         for caution in range(1, min(TRIES, len(left)) + 1):
             ranks = [candidate.rank(limits, caution) for candidate in left]

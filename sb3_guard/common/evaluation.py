@@ -497,6 +497,5 @@ class _Tally:
             unfinished=np.concatenate(self.unfinished),
             absent=tuple(key for key in self.keys if key in self.absent),
             # With sampled actions copies differ, but for their first observations.
-            copies=len(self.ended) > 1
-            and (self.copies or (self.alike and len(self.starts) > 1)),
+            copies=len(self.ended) > 1 and (self.copies or (self.alike and len(self.starts) > 1)),
         )

@@ -11,6 +11,7 @@ import pytest
 import torch as th
 from full_disk import files_end_at
 from gymnasium import spaces
+from stable_baselines3.common.callbacks import ConvertCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_guard import CPO, TD3Lag, evaluate_policy, make_vec_env
@@ -372,3 +373,11 @@ def test_other_actions_are_told_before_the_training(tmp_path):
     with pytest.raises(ValueError, match=r"the agent's actions are Box\(.* those here Box\(-20.0"):
         trained(tmp_path, 1.0, eval_env=other)
     assert not [*tmp_path.iterdir()]
+
+
+def test_a_training_that_another_callback_stops_delivers_nothing(tmp_path):
+    model = CPO("MlpPolicy", envs(), cost_limit=100.0, n_steps=10, seed=0)
+    deliver = DeliveryCallback(envs(), tmp_path, eval_freq=-1, verbose=0)
+    stop = ConvertCallback(lambda local, _: local["self"].num_timesteps < 40)
+    model.learn(100, callback=[deliver, stop])
+    assert not deliver.final and not (tmp_path / "certificate.json").exists()

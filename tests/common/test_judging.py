@@ -230,6 +230,13 @@ def test_episodes_that_follow_each_other_are_not_judged(rows, undecided):
     assert independent.verdict == "certified"
 
 
+def test_episodes_of_one_environment_are_found_whatever_the_looks_take():
+    """In each of 60 environments all episodes cost the same; looks take 17, 33 and 50 of them."""
+    levels = np.random.default_rng(0).exponential(0.2, 60)
+    judgement = decide(limits(1.0), lambda n: levels[np.arange(n) % 60, None], 100, rows=60)
+    assert "follow each other" in judgement.reason
+
+
 @pytest.mark.parametrize("costs", [[1.0, 21.0], [1.0, -0.1]])
 def test_costs_outside_of_the_exact_range_are_refused(costs):
     with pytest.raises(ValueError, match="most=20"):

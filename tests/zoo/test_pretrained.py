@@ -43,6 +43,8 @@ def test_a_shipped_agent_is_small_and_acts_as_the_one_that_was_trained(run):
     model = load_pretrained(env_id, algo, device="cpu")
     assert model.num_timesteps == result["n_timesteps"] >= 1e6  # contract.json states it
     env = model.get_env()
+    for actions, shown in pretrained.certificates(run).items():
+        assert shown.foreign(model, env, actions == "deterministic") == ""
     with np.load(RECORDED) as recorded:
         seen = recorded[f"{algo}/{env_id}/observations"]
         if isinstance(env, VecNormalize):

@@ -57,6 +57,7 @@ class Flags(Command):
 
     :param run: folder of a finished run
     :param output: folder to write to (default: agent)
+    :param gym_packages: modules that the training imported, of a run with a certificate
     """
 
     prog: ClassVar[str] = "sb3-guard hub"
@@ -67,6 +68,7 @@ class Flags(Command):
 """
     run: str = flag(default="", positional=True, metavar="RUN")
     output: str = flag("-o", default="agent", metavar="DIR")
+    gym_packages: list[str] = flag(default=[], metavar="MODULE")
 
 
 def uploaded(run: RunFolder) -> list[Path]:
@@ -108,7 +110,7 @@ def hub(flags: Flags) -> int:
     if (file := run.path / "certificate.json").is_file():
         if not (run.path / "certified_model.zip").is_file():
             raise UsageError(f"{file} is of no certified_model.zip: move it elsewhere")
-        named = {"folder": str(run.path), "gym_packages": trained.gym_packages}
+        named = {"folder": str(run.path), "gym_packages": flags.gym_packages}
         agent = open_agent(AgentFlags.of(named), None)
         with closing(agent.env):
             figures.append(agent.certified)

@@ -19,7 +19,7 @@ LINES = {
     "sb3_guard/common": 4_088,
     "sb3_guard/deployment": 879,
     "harness": 7_675,
-    "tests": 26_993,
+    "tests": 26_998,
 }
 WORDS = 65_140  # of all tracked markdown but the changelog
 

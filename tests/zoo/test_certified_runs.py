@@ -86,7 +86,7 @@ def test_the_certified_model_knows_its_age(run):
 
 
 def test_a_repository_has_the_certificate(run, capsys, tmp_path):
-    assert hub.main([str(run), "-o", str(tmp_path)]) == 0
+    assert hub.main([str(run), "-o", str(tmp_path), *TOY[:2]]) == 0
     certificate = Certificate.from_json((tmp_path / "certificate.json").read_text())
     assert str(certificate) in (tmp_path / "README.md").read_text()
     assert enjoy.main(["-f", str(tmp_path), *TOY[:2], "--n-episodes", "2", "--no-render"]) == 0
@@ -129,7 +129,12 @@ def test_a_damaged_certificate_is_a_line(run, capsys, tmp_path, damage):
     here = ["-f", str(run), *TOY[:2]]
     try:
         refused(enjoy.main, [*here, "--no-render"], capsys, f"{file} is damaged: ")
-        refused(hub.main, [str(run), "-o", str(tmp_path / "agent")], capsys, f"{file} is damaged: ")
+        refused(
+            hub.main,
+            [str(run), "-o", str(tmp_path / "agent"), *TOY[:2]],
+            capsys,
+            f"{file} is damaged: ",
+        )
         assert not (tmp_path / "agent").exists()
     finally:
         file.write_text(before)

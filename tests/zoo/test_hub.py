@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 import yaml
-from typed import PLAY, refused, trained
+from typed import PLAY, TOY, refused, trained
 
 from sb3_guard import certify_agent, enjoy, hub, train
 from sb3_guard.zoo.agents.flags import EnjoyFlags
@@ -20,7 +20,7 @@ def run(tmp_path_factory):
 
 
 def staged(run, folder):
-    assert hub.main([str(run), "-o", str(folder)]) == 0
+    assert hub.main([str(run), "-o", str(folder), *TOY[:2]]) == 0
     return (folder / "README.md").read_text()
 
 

@@ -113,12 +113,12 @@ def test_spaces_that_an_algorithm_cannot_train_on_are_named(cls: Any) -> None:
     one = spaces.Discrete(3, start=-1)
     for observed, acting in (BOX, one), (spaces.Dict(a=BOX, b=one), BOX):
         env = make_vec_env(lambda o=observed, a=acting: RandomCostEnv(o, a), 2)
-        named = f"must begin at 0|only supports|{cls.__name__} corrects"
-        with pytest.raises((ValueError, AssertionError), match=named):
+        named = f"must begin at 0|continuous actions|{cls.__name__} corrects"
+        with pytest.raises(ValueError, match=named):
             small(cls, env, "MlpPolicy" if observed is BOX else "MultiInputPolicy")
     if cls in FILTERED or cls in OFF_POLICY:
         env = make_vec_env(lambda: RandomCostEnv(BOX, spaces.Discrete(3)), 2)
-        with pytest.raises((ValueError, AssertionError), match=r"actions of a Box|only supports"):
+        with pytest.raises(ValueError, match=r"actions of a Box|continuous actions"):
             small(cls, env)
 
 

@@ -35,7 +35,7 @@ def named(key: str, limit_on: str) -> str:
 
 
 def physics_errors(number: int) -> str:
-    """What messages add about episodes that ended in a physics error, whose costs are unknown."""
+    """Suffix of messages: the episodes that ended in a physics error, whose costs are unknown."""
     return f" ({number} episodes ended in a physics error)" if number else ""
 
 
@@ -201,7 +201,7 @@ class Bound:
 
     @property
     def verdict(self) -> Verdict:
-        """What the bounds say."""
+        """*certified*: the upper bound is within the limit; *exceeded*: the lower is not."""
         if self.upper <= self.limit:
             return "certified"
         return "exceeded" if self.lower > self.limit else "undecided"

@@ -280,8 +280,9 @@ def refuse_training_only(env: VecEnv) -> None:
         would be certified
     """
     marks = [getattr(env, "training_only", False)]  # of any wrapper of a VecEnv
-    with suppress(AttributeError, NotImplementedError):
-        marks += env.get_attr("training_only")  # of single environments
+    with suppress(NotImplementedError):  # a vectorised environment need not tell
+        if env.has_attr("training_only"):  # single environments
+            marks += env.get_attr("training_only")
     if any(marks):
         raise ValueError("a wrapper of env is for training only: certify without it")
     if fault := own_statistics(env):

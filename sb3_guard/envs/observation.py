@@ -145,7 +145,7 @@ class Lidar(Parameters):
         return Channel(bodies * self.size(planar), 0.0, 1.0, "closeness")
 
     def described(self, planar: bool) -> dict[str, Any]:
-        """What its numbers are, for a sensor that delivers the same."""
+        """The meaning of its numbers, for a sensor that delivers the same."""
         columns, rows = (self.bins, 1) if planar else (self.azimuth, self.elevation)
         a, e = 360 / columns, 180 / rows
         bins = f"azimuths from {a:g} i to {a:g} (i + 1) degrees, from x towards y"

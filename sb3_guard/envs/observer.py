@@ -67,7 +67,7 @@ class Observer:
         return {name: self._channel(what) for name, what in part.observations().items()}
 
     def described(self) -> dict[str, dict[str, Any]]:
-        """What real sensors have to deliver, by component: formula, order, frames and axes."""
+        """Formula, order, frames and axes that real sensors have to deliver, by component."""
         robot, found = self._robot, dict[str, dict[str, Any]]()
         bodies: Any = getattr(robot, "sensing", None) or getattr(robot, "lidar_bodies", ())
         for name, what in [each for part in self._parts for each in part.observations().items()]:

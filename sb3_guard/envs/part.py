@@ -431,7 +431,7 @@ class Constraint(Part):
         raise NotImplementedError
 
     def per_step(self) -> str:
-        """What a step costs: the docstring from "Cost" on, with the values of ``parameters``."""
+        """The cost of a step: the docstring from "Cost" on, with the values of its parameters."""
         said = "".join(re.findall(r"\bCost\b.*", self.__doc__ or "", re.DOTALL))
         values = {name: str(value) for name, value in vars(self).items() if value is not None}
         return re.sub("``(.*?)``", lambda it: values.get(it[1], it[1]), " ".join(said.split()))

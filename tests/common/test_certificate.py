@@ -2,6 +2,7 @@
 
 import json
 import math
+from contextlib import closing
 
 import gymnasium as gym
 import numpy as np
@@ -10,7 +11,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.running_mean_std import RunningMeanStd
-from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor, VecNormalize
 
 from sb3_guard import CPO, SCPO, DeliveryCallback, make_vec_env
 from sb3_guard.common.certificate import Certificate, certify
@@ -84,6 +85,11 @@ class Bounded(Lottery):
     def step(self, action):
         *rest, _ = super().step(action)
         return *rest, {"cost": 4.0 * (self.np_random.random() < 0.1)}
+
+
+def test_environments_in_processes_are_certified():
+    with closing(SubprocVecEnv([Lottery] * 2, start_method="fork")) as env:
+        assert certify(Idle(), env, 3.0, n_episodes=100, seed=1).verdict == "certified"
 
 
 def test_an_exact_certificate():

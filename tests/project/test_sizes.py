@@ -13,15 +13,15 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 27_369,
+    "sb3_guard": 27_370,
     "sb3_guard/envs": 9_013,
     "sb3_guard/algorithms": 5_714,
-    "sb3_guard/common": 4_088,
+    "sb3_guard/common": 4_089,
     "sb3_guard/deployment": 879,
     "harness": 7_675,
-    "tests": 26_998,
+    "tests": 27_004,
 }
-WORDS = 65_140  # of all tracked markdown but the changelog
+WORDS = 65_137  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

@@ -122,7 +122,7 @@ def _center(model: mujoco.MjModel, file: ModelFile, center: str) -> tuple[str, s
 
 
 def _arm(end: str, places: Array, shoulder: Array, reach: float | None) -> dict[str, Any]:
-    """What follows from where an arm's end effector can be, [n, 3] m, and from its first joint.
+    """Attributes by an arm's first joint and the places of its end effector, [n, 3] m.
 
     :param reach: None: measured
     :raises ValueError: its end effector, ``end``, is never above the floor

@@ -414,7 +414,7 @@ class MJCFRobot(Robot):
         return Values(self._last, unit="action")
 
     def described(self, name: str) -> dict[str, Any]:
-        """What an observation measures, for the loop around a policy.
+        """The quantity that an observation measures, for the loop around a policy.
 
         :return: ``sensor``, ``on`` and ``axes``; of joints ``joints``, ``first_pose``, qpos that
             positions are relative to, rad or m, and ``unit`` of each number where these differ
